@@ -1,0 +1,1 @@
+"""What the planner believes about light, fitted to captures."""

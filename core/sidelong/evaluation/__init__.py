@@ -1,0 +1,1 @@
+"""Recorded data sets and the comparison of strategies against the truth."""

@@ -1,0 +1,1 @@
+"""From several depth maps to the completed depth of the reference view."""

@@ -1,0 +1,1 @@
+"""Frames, cameras, meshes and rays."""

@@ -1,0 +1,189 @@
+"""CAD models: reading, checking and simplifying them. The only caller of trimesh."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sidelong.errors import MeshError, UnknownNameError
+from sidelong.types import FloatArray, IntArray
+
+METRES_PER_UNIT = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 25.4e-3}
+SMALLEST_PART_M, LARGEST_PART_M = 0.5e-3, 5.0
+"""Largest extents of a part a cell handles; a file outside them is in another unit than it says."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part as its CAD file describes it, in its own object frame.
+
+    Attributes
+    ----------
+    name
+        Of the part, for messages and files.
+    vertices_m
+        (V, 3) metres.
+    triangles
+        (F, 3) vertex indices, counter-clockwise seen from outside.
+    triangle_material
+        (F,) index into ``materials``.
+    materials
+        Names of materials.
+    """
+
+    name: str
+    vertices_m: FloatArray
+    triangles: IntArray
+    triangle_material: IntArray
+    materials: tuple[str, ...]
+
+    @cached_property
+    def triangle_normals(self) -> FloatArray:
+        """(F, 3) outward unit normals; zero for a triangle without area."""
+        corners = self.vertices_m[self.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+
+    @cached_property
+    def centre_m(self) -> FloatArray:
+        """(3,) centre of the bounding box."""
+        return (self.vertices_m.min(axis=0) + self.vertices_m.max(axis=0)) / 2
+
+    @cached_property
+    def diameter_m(self) -> float:
+        """Largest distance between two vertices (of the convex hull)."""
+        import trimesh
+        from scipy.spatial.distance import pdist
+
+        hull = trimesh.Trimesh(self.vertices_m, self.triangles, process=False).convex_hull
+        return float(pdist(np.asarray(hull.vertices)).max())
+
+
+def part_from_arrays(
+    name: str,
+    vertices_m: FloatArray,
+    triangles: IntArray,
+    triangle_material: IntArray | None = None,
+    materials: tuple[str, ...] = ("stainless",),
+) -> Part:
+    """Check a triangle mesh and return it as a part.
+
+    Raises
+    ------
+    MeshError
+        The mesh is empty, has coordinates that are not finite, is not watertight, or its largest extent lies outside
+        ``SMALLEST_PART_M`` to ``LARGEST_PART_M``.
+    """
+    import trimesh
+
+    if len(triangles) == 0 or len(vertices_m) == 0:
+        raise MeshError(f"{name}: the mesh is empty ({len(vertices_m)} vertices, {len(triangles)} triangles)")
+    if not np.isfinite(vertices_m).all():
+        raise MeshError(f"{name}: {int((~np.isfinite(vertices_m)).sum())} vertex coordinates are not finite")
+    extent_m = float(np.ptp(vertices_m, axis=0).max())
+    if not SMALLEST_PART_M <= extent_m <= LARGEST_PART_M:
+        likely = "metres" if extent_m < SMALLEST_PART_M else "a smaller unit than declared"
+        raise MeshError(
+            f"{name}: the largest extent is {extent_m * 1e3:.4g} mm, limits {SMALLEST_PART_M * 1e3:g} to "
+            f"{LARGEST_PART_M * 1e3:g} mm; the file seems to be in {likely}: declare its unit in the .json beside it"
+        )
+    mesh = trimesh.Trimesh(vertices_m, triangles, process=False)
+    if not mesh.is_watertight:
+        edges = np.sort(mesh.edges, axis=1)
+        open_edges = int((np.unique(edges, axis=0, return_counts=True)[1] != 2).sum())
+        raise MeshError(
+            f"{name}: the mesh is not watertight, {open_edges} edges have not exactly two triangles, limit 0"
+        )
+    if mesh.volume < 0:
+        triangles = np.ascontiguousarray(triangles[:, ::-1])
+    if triangle_material is None:
+        triangle_material = np.zeros(len(triangles), dtype=np.intp)
+    return Part(name, np.asarray(vertices_m, dtype=np.float64), triangles, triangle_material, materials)
+
+
+def load_part(path: Path) -> Part:
+    """Read a CAD file (STL, OBJ, PLY, OFF) and the material file of the same name beside it, if there is one.
+
+    The material file is ``{"unit": "mm", "face_ranges": [[first, last, material], ...]}``, last exclusive, in the face
+    order of the file. Without it the unit is mm and the material ``stainless``.
+
+    Raises
+    ------
+    UnknownNameError
+        The file does not exist.
+    MeshError
+        It cannot be read, the material file does not fit it, or ``part_from_arrays`` refuses the mesh.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise UnknownNameError(f"{path}: no such CAD file")
+    try:
+        # no merging on load: face_ranges count the faces of the file
+        mesh: Any = trimesh.load_mesh(path, process=False)
+        vertices, triangles = (
+            np.asarray(mesh.vertices, dtype=np.float64),
+            np.asarray(mesh.faces, dtype=np.intp),
+        )
+    except Exception as error:  # noqa: BLE001 - trimesh raises whatever its readers raise; all mean "unreadable"
+        raise MeshError(f"{path}: cannot be read as a mesh: {error}") from error
+    if len(triangles) == 0:
+        raise MeshError(f"{path}: the mesh is empty (0 triangles)")
+    unit, triangle_material, materials = _read_materials(path.with_suffix(".json"), len(triangles))
+    vertices, inverse = np.unique(vertices, axis=0, return_inverse=True)
+    welded = inverse.reshape(-1)[triangles]
+    try:
+        return part_from_arrays(path.stem, vertices * METRES_PER_UNIT[unit], welded, triangle_material, materials)
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+
+
+def _read_materials(path: Path, triangle_count: int) -> tuple[str, IntArray, tuple[str, ...]]:
+    """Return unit, material index per triangle, and material names."""
+    if not path.is_file():
+        return "mm", np.zeros(triangle_count, dtype=np.intp), ("stainless",)
+    try:
+        content = json.loads(path.read_text())
+        unit = str(content.get("unit", "mm"))
+        ranges = [(int(a), int(b), str(name)) for a, b, name in content.get("face_ranges", [])]
+    except (ValueError, TypeError, AttributeError) as error:
+        raise MeshError(f"{path}: cannot be read as a material file: {error}") from error
+    if unit not in METRES_PER_UNIT:
+        raise MeshError(f"{path}: unit is {unit!r}, known units are {', '.join(METRES_PER_UNIT)}")
+    if not ranges:
+        return unit, np.zeros(triangle_count, dtype=np.intp), ("stainless",)
+    materials = tuple(dict.fromkeys(name for _, _, name in ranges))
+    index = np.full(triangle_count, -1, dtype=np.intp)
+    for first, last, name in ranges:
+        if not 0 <= first < last <= triangle_count:
+            raise MeshError(f"{path}: face range {first}..{last} lies outside 0..{triangle_count}")
+        index[first:last] = materials.index(name)
+    if (index < 0).any():
+        raise MeshError(f"{path}: {int((index < 0).sum())} of {triangle_count} faces have no material")
+    return unit, index, materials
+
+
+def simplified(part: Part, max_triangles: int) -> Part:
+    """Return a coarser part for visibility rays (3,000 triangles: depth p99 error 0.024 mm); materials are dropped."""
+    if len(part.triangles) <= max_triangles:
+        return part
+    import open3d as o3d
+
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(part.vertices_m),
+        o3d.utility.Vector3iVector(part.triangles.astype(np.int32)),
+    ).simplify_quadric_decimation(max_triangles)
+    triangles = np.asarray(mesh.triangles).astype(np.intp)
+    return Part(
+        part.name,
+        np.asarray(mesh.vertices),
+        triangles,
+        np.zeros(len(triangles), dtype=np.intp),
+        part.materials[:1],
+    )

@@ -1,0 +1,1 @@
+"""From hypotheses to the next view: equations (12) to (15) of the paper."""

@@ -1,0 +1,66 @@
+"""What the planner believes about light: materials, projector, sensor."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from sidelong.errors import SettingsError
+from sidelong.physics.reflectance import PAPER_MATERIALS, Phong
+from sidelong.physics.response import Response
+
+Share = Annotated[FiniteFloat, Field(ge=0)]
+
+
+class MaterialSettings(BaseModel):
+    """Phong reflectance of a material."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    k_d: Share = Field(description="diffuse share")
+    k_s: Share = Field(description="specular share")
+    n: Annotated[FiniteFloat, Field(ge=0, le=1e6, description="glossiness")]
+
+
+class LightSettings(BaseModel):
+    """Projector, sensor response and reflectance of the materials in the cell."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    intensity: Annotated[FiniteFloat, Field(gt=0, description="projector intensity at 1 m, in saturation/s")] = 100.0
+    gamma: Annotated[FiniteFloat, Field(gt=0, le=10, description="response Z = 255 X^(1/gamma)")] = 1.0
+    fall_off: bool = Field(default=True, description="light falls with the squared distance from the projector")
+    shadows: Literal["none", "self", "all"] = Field(
+        default="all",
+        description="what may hide a point from cameras and projector: nothing, its own part, all parts",
+    )
+    materials: dict[str, MaterialSettings] = Field(
+        default_factory=dict[str, MaterialSettings], description="by name; the paper's three are known"
+    )
+
+    def response(self) -> Response:
+        """Return the sensor's response."""
+        return Response.gamma(self.gamma)
+
+    def reflectances(self, names: tuple[str, ...]) -> tuple[Phong, ...]:
+        """Return the reflectance of each named material.
+
+        Raises
+        ------
+        SettingsError
+            A material is unknown.
+        """
+        known = PAPER_MATERIALS | {name: Phong(m.k_d, m.k_s, m.n) for name, m in self.materials.items()}
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise SettingsError(
+                f"light.materials: no reflectance for material {unknown[0]!r}; known are {', '.join(sorted(known))}"
+            )
+        return tuple(known[name] for name in names)
+
+
+def material_column(reflectances: tuple[Phong, ...], parameter: Literal["k_d", "k_s", "n"]):
+    """Return one parameter of all materials as an array to index by material."""
+    return np.array([getattr(material, parameter) for material in reflectances], dtype=np.float64)

@@ -1,0 +1,187 @@
+"""Settings of a scan, and the one place that chooses the parts a scene needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Protocol, Self
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from sidelong.detection.settings import DetectionSettings
+from sidelong.physics.sensing import SensingSettings
+from sidelong.planning.light import LightSettings
+from sidelong.planning.selection import Strategy, StrategyName, strategy_of
+from sidelong.types import DetectedObject, GrayImage
+
+if TYPE_CHECKING:  # the service reads recipes without open3d
+    from sidelong.geometry.camera_model import StereoRig
+    from sidelong.geometry.mesh import Part
+    from sidelong.planning.gain import LightModel
+
+ExposureS = Annotated[FiniteFloat, Field(ge=1e-6, le=10)]
+
+
+class PlanningSettings(BaseModel):
+    """How views are chosen and when a scan ends."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    strategy: Annotated[StrategyName, Field(strict=False, description="nbv, random or max_distance")] = StrategyName.NBV
+    seed: Annotated[int, Field(ge=0, lt=2**32, description="of the random strategy")] = 0
+    max_views: Annotated[int, Field(ge=0, le=100, description="views after the reference view")] = 3
+    gain_threshold_px: Annotated[FiniteFloat, Field(ge=0, description="end below this G, pixels")] = 0.0
+    gain_threshold_share: Annotated[
+        FiniteFloat, Field(ge=0, le=1, description="end below this G, share of the pixels still missing")
+    ] = 0.01
+    stride_px: Annotated[int, Field(ge=1, le=16, description="every how many-th row and column is scored")] = 3
+
+
+class Recipe(BaseModel):
+    """All settings of a scan; the defaults run the simulated cell."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    detection: DetectionSettings = DetectionSettings()
+    planning: PlanningSettings = PlanningSettings()
+    light: LightSettings = LightSettings()
+    sensing: SensingSettings = SensingSettings()
+    image_exposure_s: ExposureS = Field(default=0.2, description="of the image that detection reads, projector off")
+    depth_exposure_s: ExposureS = Field(default=0.012, description="of the depth captures")
+    move_deadline_s: Annotated[FiniteFloat, Field(gt=0, le=600, description="for one move")] = 30.0
+
+
+class Detector(Protocol):
+    """Finds objects in the projector-off image of the reference view."""
+
+    def detect(self, image: GrayImage) -> tuple[DetectedObject, ...]:
+        """Return the objects, none where nothing was found."""
+        ...
+
+    def close(self) -> None:
+        """Release what it holds."""
+        ...
+
+
+@dataclass(frozen=True)
+class GivenObjects:
+    """Stands in for a detector where the poses are known already: detection is left out."""
+
+    objects: tuple[DetectedObject, ...]
+
+    def detect(self, image: GrayImage) -> tuple[DetectedObject, ...]:
+        """Return the given objects, whatever the image."""
+        return self.objects
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """The parts of a scan, chosen once.
+
+    Attributes
+    ----------
+    part, rig
+        What is looked for, and with which cameras.
+    detector, strategy
+        Stages that keep a state of their own.
+    light
+        From geometry to the probability of depth; its exposure is replaced by the applied one.
+    left_out
+        Terms that are not computed, each with the reason.
+    """
+
+    part: Part
+    rig: StereoRig
+    detector: Detector
+    strategy: Strategy
+    light: LightModel
+    left_out: tuple[str, ...]
+
+    def close(self) -> None:
+        """Release the detector's child process."""
+        self.detector.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def build_stages(
+    recipe: Recipe,
+    part: Part,
+    rig: StereoRig,
+    cache_dir: Path,
+    *,
+    objects: tuple[DetectedObject, ...] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Stages:
+    """Choose the parts a scene needs.
+
+    Parameters
+    ----------
+    recipe
+        Settings.
+    part, rig
+        What is looked for, and with which cameras.
+    cache_dir
+        Where trained templates are kept.
+    objects
+        Poses that are known already; detection is left out.
+    progress
+        Called with (done, total) while templates are trained.
+
+    Raises
+    ------
+    SettingsError
+        A material of the part has no reflectance, or a setting does not fit the part.
+    """
+    from sidelong.planning.gain import LightModel
+
+    light = LightModel(
+        reflectances=recipe.light.reflectances(part.materials),
+        intensity=recipe.light.intensity,
+        fall_off=recipe.light.fall_off,
+        shadows=recipe.light.shadows,
+        exposure_s=recipe.depth_exposure_s,
+        response=recipe.light.response(),
+        sensing=recipe.sensing,
+    )
+    detector = GivenObjects(objects) if objects is not None else _trained(recipe, part, rig, cache_dir, progress)
+    strategy = strategy_of(recipe.planning.strategy, recipe.planning.seed)
+    return Stages(part, rig, detector, strategy, light, _left_out(recipe, given=objects is not None))
+
+
+def _trained(
+    recipe: Recipe, part: Part, rig: StereoRig, cache_dir: Path, progress: Callable[[int, int], None] | None
+) -> Detector:
+    from sidelong.detection.line2d import Line2DDetector
+
+    detector = Line2DDetector(part, rig.left, recipe.detection, cache_dir)
+    detector.prepare(progress)
+    return detector
+
+
+def _left_out(recipe: Recipe, *, given: bool) -> tuple[str, ...]:
+    """Name the terms that are not computed, each with the reason."""
+    terms = {
+        "detection: left out, the poses are given": given,
+        "second camera: left out, sensing.stereo is off": not recipe.sensing.stereo,
+        "light fall-off: left out, light.fall_off is off": not recipe.light.fall_off,
+        "occlusion by other parts: left out, light.shadows is not 'all'": recipe.light.shadows != "all",
+        "occlusion by the own part: left out, light.shadows is 'none'": recipe.light.shadows == "none",
+        "score of all candidates: left out, the strategy does not compare them": (
+            recipe.planning.strategy is not StrategyName.NBV
+        ),
+        "ambient light: left out, the projector outshines it (paper, equation (1))": True,
+        "inter-reflection: left out, not modelled yet": True,
+    }
+    return tuple(term for term, applies in terms.items() if applies)

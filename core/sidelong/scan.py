@@ -1,0 +1,156 @@
+"""Next-best-view depth completion: Algorithm 1 of Yang and Waslander.
+
+for step in scan(cell, stages, recipe, Stopwatch()):
+    print(step.index, step.view.name, step.completeness)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sidelong.devices import CaptureRequest, Cell
+from sidelong.fusion.completion import Completion
+from sidelong.geometry.transforms import invert
+from sidelong.planning.gain import Planner
+from sidelong.planning.prior import believe
+from sidelong.planning.selection import below_threshold, best_of
+from sidelong.recipe import PlanningSettings, Recipe, Stages
+from sidelong.stopwatch import Stopwatch
+from sidelong.types import BoolArray, Frame, Projector, Score, Step, Stop, View
+
+
+def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> Iterator[Step]:
+    """Complete the depth of the cell's reference view.
+
+    Yields a :class:`Step` after every view, the reference view included. The last one says why the scan ended.
+
+    Parameters
+    ----------
+    cell
+        Opened camera and arm, reference view, candidate views.
+    stages
+        From :func:`sidelong.recipe.build_stages`.
+    recipe
+        Settings.
+    stopwatch
+        Measures the stages capture, detect, score, move and fuse.
+
+    Raises
+    ------
+    DeviceError
+        Camera or arm failed, or the arm was stopped.
+    DepthError
+        The reference view measured no depth at all.
+    DetectionError
+        The matcher failed.
+    """
+    depth_request = CaptureRequest(Projector.DOTS, recipe.depth_exposure_s, depth=True)
+
+    # input of Algorithm 1: I_o with the projector off and a long exposure, and D_o
+    view = _move(cell, cell.reference, recipe, stopwatch)
+    image = _capture(cell, view, CaptureRequest(Projector.OFF, recipe.image_exposure_s), stopwatch)
+    frame = _capture(cell, view, depth_request, stopwatch)
+    completion = Completion(frame, stages.rig.left)
+    missing_at_first = completion.missing.copy()
+
+    # 1: Line2D, I_o -> {q}
+    with stopwatch.stage("detect"):
+        objects = stages.detector.detect(image.left)
+
+    # 2: prior, {q} -> {D, N} at the missing pixels
+    with stopwatch.stage("score"):
+        belief = believe(
+            objects,
+            stages.part,
+            stages.rig.left,
+            view.base_T_camera,
+            missing_at_first,
+            recipe.planning.stride_px,
+        )
+        light = replace(stages.light, exposure_s=frame.exposure_s)
+        planner = Planner(belief, stages.part, stages.rig, light)
+
+    taken = [view]
+    step = Step(
+        index=0, view=view, frame=frame, objects=objects, depth_m=completion.depth_m.copy(),
+        source=completion.source.copy(), missing_px=int(belief.target.sum()), recovered_px=0, predicted_gain_px=0.0,
+        measured_gain_px=0.0, scores=(), stage_s={}, stop=None, left_out=stages.left_out,
+    )  # fmt: skip
+    while True:
+        # 3: G_i of each candidate, equation (13), unless the scan ends here anyway
+        stop, best = _spent(step, recipe.planning), None
+        if stop is None:
+            with stopwatch.stage("score"):
+                step = replace(step, scores=_score(cell, stages, planner, taken, completion.missing))
+            best = best_of(step.scores)
+            stop = _not_worth_it(step, best, recipe.planning)
+
+        # 6: termination
+        step = replace(step, stage_s=stopwatch.lap(), stop=stop)
+        yield step
+        if stop is not None or best is None:
+            return
+
+        # 4: move to the argmax, equation (14)
+        view = _move(cell, best.view, recipe, stopwatch)
+        taken.append(view)
+
+        # 5: capture D*, fuse
+        frame = _capture(cell, view, depth_request, stopwatch)
+        with stopwatch.stage("fuse"):
+            completion.add(frame)
+        recovered_px = int((belief.target & ~completion.missing).sum())
+        step = replace(
+            step, index=step.index + 1, view=view, frame=frame, depth_m=completion.depth_m.copy(),
+            source=completion.source.copy(), recovered_px=recovered_px, predicted_gain_px=best.gain_px,
+            measured_gain_px=float(recovered_px - step.recovered_px), scores=(),
+        )  # fmt: skip
+
+
+def _move(cell: Cell, view: View, recipe: Recipe, stopwatch: Stopwatch) -> View:
+    """Move the camera to a view and return where the arm says it is."""
+    with stopwatch.stage("move"):
+        state = cell.arm.move(view.base_T_camera @ invert(cell.flange_T_camera), recipe.move_deadline_s)
+    return View(view.name, state.base_T_flange @ cell.flange_T_camera)
+
+
+def _capture(cell: Cell, view: View, request: CaptureRequest, stopwatch: Stopwatch) -> Frame:
+    with stopwatch.stage("capture"):
+        return replace(cell.camera.capture(request, view.base_T_camera), view=view)
+
+
+def _score(cell: Cell, stages: Stages, planner: Planner, taken: list[View], missing: BoolArray) -> tuple[Score, ...]:
+    """Score the shortlisted candidates; the others come with the reason why they cannot be taken."""
+    taken_names = {view.name for view in taken}
+    dropped: list[Score] = []
+    open_views: list[View] = []
+    for view in cell.candidates:
+        reason = "already taken" if view.name in taken_names else None
+        reason = reason or cell.arm.unreachable(view.base_T_camera @ invert(cell.flange_T_camera))
+        if reason is None:
+            open_views.append(view)
+        else:
+            dropped.append(Score(view, gain_px=0.0, dropped=reason))
+    shortlist = stages.strategy.shortlist(open_views, taken)
+    return (*(planner.score(view, missing) for view in shortlist), *dropped)
+
+
+def _spent(step: Step, settings: PlanningSettings) -> Stop | None:
+    """Say why the scan ends here whatever the candidates promise, if it does."""
+    if not step.objects:
+        return Stop.NO_OBJECTS
+    if step.recovered_px >= step.missing_px:
+        return Stop.NOTHING_MISSING
+    return Stop.MAX_VIEWS if step.index >= settings.max_views else None
+
+
+def _not_worth_it(step: Step, best: Score | None, settings: PlanningSettings) -> Stop | None:
+    """Say why no candidate is worth a move, if none is; equation (15)."""
+    if best is None:
+        return Stop.NO_REACHABLE_VIEW
+    still_missing_px = step.missing_px - step.recovered_px
+    thresholds = settings.gain_threshold_px, settings.gain_threshold_share
+    return Stop.GAIN_BELOW_THRESHOLD if below_threshold(best.gain_px, still_missing_px, *thresholds) else None

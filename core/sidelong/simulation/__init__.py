@@ -1,0 +1,1 @@
+"""Parts, bins and a sensor: the simulated cell that ships with sidelong."""

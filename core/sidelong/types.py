@@ -1,0 +1,200 @@
+"""What the stages of a scan hand to each other.
+
+Frames are written ``a_T_b``: the 4x4 matrix that maps coordinates in b to coordinates in a. Units are SI, missing
+depth is NaN, ``pixels`` are integer (row, column) pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.intp]
+BoolArray: TypeAlias = NDArray[np.bool_]
+GrayImage: TypeAlias = NDArray[np.uint8]
+
+
+class Projector(StrEnum):
+    """What the projector shows during a capture."""
+
+    OFF = "off"
+    WHITE = "white"
+    DOTS = "dots"
+
+
+class Stop(StrEnum):
+    """Why a scan ended as it should."""
+
+    GAIN_BELOW_THRESHOLD = "gain_below_threshold"
+    MAX_VIEWS = "max_views"
+    NOTHING_MISSING = "nothing_missing"
+    NO_OBJECTS = "no_objects"
+    NO_REACHABLE_VIEW = "no_reachable_view"
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A place for the camera: ``base_T_camera`` (4, 4), left rectified camera in the base frame, metres."""
+
+    name: str
+    base_T_camera: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One capture.
+
+    Attributes
+    ----------
+    view
+        Where the camera was, as read back from the arm.
+    left, right
+        Rectified 8-bit images (H, W); ``right`` is None where the source has none.
+    depth_m
+        Depth along the optical axis of the left camera (H, W), NaN where nothing was measured; None where the capture
+        was not asked for depth.
+    projector, exposure_s
+        What was applied, not what was asked for.
+    started_s, ended_s
+        Monotonic clock.
+    """
+
+    view: View
+    left: GrayImage
+    right: GrayImage | None
+    depth_m: FloatArray | None
+    projector: Projector
+    exposure_s: float
+    started_s: float = 0.0
+    ended_s: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One pose an object may have: ``camera_T_object`` (4, 4), the matcher's score 0..100, the probability 0..1."""
+
+    camera_T_object: FloatArray
+    score: float
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedObject:
+    """An object of the reference image and its pose hypotheses, most probable first; probabilities sum to 1."""
+
+    hypotheses: tuple[Hypothesis, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What one hypothesis of one object says of the pixels that have no depth: D_k and N_k of equation (13).
+
+    Attributes
+    ----------
+    object_index
+        Position in the list of detected objects.
+    probability
+        Of the hypothesis, given the object.
+    weight
+        How many image pixels each entry stands for (stride squared).
+    pixels
+        (N, 2) row and column in the reference image.
+    points_base, normals_base
+        (N, 3) surface points in metres and outward unit normals in the base frame.
+    material
+        (N,) index into the part's materials.
+    base_T_object
+        (4, 4) the hypothesis itself.
+    """
+
+    object_index: int
+    probability: float
+    weight: float
+    pixels: IntArray
+    points_base: FloatArray
+    normals_base: FloatArray
+    material: IntArray
+    base_T_object: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """What the planner expects of one candidate view.
+
+    Attributes
+    ----------
+    view
+        The candidate.
+    gain_px
+        G_i of equation (13): expected number of missing pixels the view measures.
+    lost_px
+        Expected pixels lost, by reason: outside, hidden, shadow, dark, saturated.
+    dropped
+        Why the candidate cannot be taken (already taken, unreachable ...); None where it can.
+    """
+
+    view: View
+    gain_px: float
+    lost_px: Mapping[str, float] = field(default_factory=dict[str, float])
+    dropped: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What a scan knows after a view. The first step is the reference view.
+
+    Attributes
+    ----------
+    index
+        0 for the reference view, then 1, 2, ...
+    view
+        Where the camera was.
+    frame
+        The depth capture of this view.
+    objects
+        What was detected in the reference view.
+    depth_m
+        (H, W) completed depth of the reference view, NaN where missing.
+    source
+        (H, W) index of the step that measured each pixel, -1 where missing.
+    missing_px
+        Pixels on the detected objects that had no depth in the reference view.
+    recovered_px
+        How many of those have depth now.
+    predicted_gain_px, measured_gain_px
+        Gain of this view: G of equation (13) beforehand, newly completed target pixels afterwards; 0 at the reference.
+    scores
+        All candidates, as scored before the next move; empty where the scan ended before scoring.
+    stage_s
+        Seconds spent in each stage (capture, detect, score, move, fuse) since the step before.
+    stop
+        Why the scan ended, on the last step; None before it.
+    left_out
+        Terms of the model that were left out, each with the reason.
+    """
+
+    index: int
+    view: View
+    frame: Frame
+    objects: tuple[DetectedObject, ...]
+    depth_m: FloatArray
+    source: IntArray
+    missing_px: int
+    recovered_px: int
+    predicted_gain_px: float
+    measured_gain_px: float
+    scores: tuple[Score, ...]
+    stage_s: Mapping[str, float]
+    stop: Stop | None
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def completeness(self) -> float:
+        """Recovered over missing pixels, 0..1; 1 where nothing was missing."""
+        return self.recovered_px / self.missing_px if self.missing_px else 1.0

@@ -1,0 +1,1 @@
+"""Cameras and arms behind two small protocols."""

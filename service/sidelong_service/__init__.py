@@ -1,0 +1,1 @@
+"""HTTP service, command line, processes and storage around the sidelong planner."""
