@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from sidelong.detection.settings import DetectionSettings
 from sidelong.physics.sensing import SensingSettings
-from sidelong.planning.light import LightSettings
+from sidelong.planning.light import DEFAULT_INTENSITY, LightSettings
 from sidelong.planning.selection import Strategy, StrategyName, strategy_of
 from sidelong.types import DetectedObject, GrayImage
 
@@ -148,7 +148,7 @@ def build_stages(
 
     light = LightModel(
         reflectances=recipe.light.reflectances(part.materials),
-        intensity=recipe.light.intensity,
+        intensity=recipe.light.intensity or DEFAULT_INTENSITY,
         fall_off=recipe.light.fall_off,
         shadows=recipe.light.shadows,
         exposure_s=recipe.depth_exposure_s,

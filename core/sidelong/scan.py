@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
-
 from sidelong.devices import CaptureRequest, Cell
 from sidelong.fusion.completion import Completion
 from sidelong.geometry.transforms import invert

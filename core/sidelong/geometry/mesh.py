@@ -131,7 +131,7 @@ def load_part(path: Path) -> Part:
             np.asarray(mesh.vertices, dtype=np.float64),
             np.asarray(mesh.faces, dtype=np.intp),
         )
-    except Exception as error:  # noqa: BLE001 - trimesh raises whatever its readers raise; all mean "unreadable"
+    except Exception as error:  # trimesh raises whatever its readers raise; all mean "unreadable"
         raise MeshError(f"{path}: cannot be read as a mesh: {error}") from error
     if len(triangles) == 0:
         raise MeshError(f"{path}: the mesh is empty (0 triangles)")

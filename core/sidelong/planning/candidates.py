@@ -38,7 +38,7 @@ def dome_views(target_m: tuple[float, float, float], settings: DomeSettings) -> 
         Distances, elevations, number around.
     """
     target = np.asarray(target_m, dtype=np.float64)
-    views = [View("top", look_at(target + (0.0, 0.0, settings.distances_m[0]), target))]
+    views = [View("top", look_at(target + np.array([0.0, 0.0, settings.distances_m[0]]), target))]
     for ring, elevation_deg in enumerate(settings.elevations_deg):
         distance_m = settings.distances_m[ring % len(settings.distances_m)]
         elevation = np.deg2rad(elevation_deg)

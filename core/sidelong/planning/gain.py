@@ -85,10 +85,20 @@ class Planner:
         self._prior_of_point = np.repeat(np.arange(len(sizes)), sizes)
         self._points = _stack([p.points_base for p in belief.priors], 3)
         self._normals = _stack([p.normals_base for p in belief.priors], 3)
-        self._pixels = _stack([p.pixels for p in belief.priors], 2).astype(np.intp)
+        self._pixels = np.concatenate([np.zeros((0, 2), np.intp), *(p.pixels for p in belief.priors)])
         self._material = np.concatenate([np.zeros(0, np.intp), *(p.material for p in belief.priors)])
         self._object = np.repeat([p.object_index for p in belief.priors], sizes).astype(np.intp)
         self._weight = np.repeat([p.probability * p.weight for p in belief.priors], sizes).astype(np.float64)
+        # visibility rays start a little above the surface
+        self._starts = self._points + SURFACE_OFFSET_M * self._normals
+        self._object_T_base = invert(np.array([p.base_T_object for p in belief.priors]).reshape(-1, 4, 4))
+        self._starts_object = _stack(
+            [
+                transform_points(self._object_T_base[k], self._starts[self._prior_of_point == k])
+                for k in range(len(sizes))
+            ],
+            3,
+        )
         coarse = simplified(part, OCCLUDER_TRIANGLES) if light.shadows != "none" else part
         self._alone = RayScene([(coarse, np.eye(4))] if light.shadows != "none" else [])
         self._together = RayScene([(coarse, pose) for pose in belief.base_T_objects] if light.shadows == "all" else [])
@@ -114,6 +124,24 @@ class Planner:
             gain_px=float(weight @ outlook.probability),
             lost_px={reason: float(lost[code]) for code, reason in enumerate(REASONS)},
         )
+
+    def left_radiance(self, view: View) -> tuple[IntArray, FloatArray]:
+        """Return what the left camera should receive from the points that it and the projector reach.
+
+        Returns
+        -------
+        pixels
+            (M, 2) of the points, in the image the belief was made for.
+        radiance
+            (M,) E of equation (5), in units of the sensor's saturation exposure per second.
+        """
+        left, _, projector = self._centres(view.base_T_camera)
+        chosen = np.flatnonzero(self._inside(view.base_T_camera))
+        for target in (left, projector):
+            chosen = chosen[~self._blocked(chosen, target)]
+        to_left, to_light = _unit(left - self._points[chosen]), _unit(projector - self._points[chosen])
+        power = self._incident(projector, chosen)
+        return self._pixels[chosen], self._radiance(power, (to_light, to_left), chosen)
 
     def _outlook(self, view: View) -> Outlook:
         """Predict what the view would measure: h of equation (12) for each point."""
@@ -160,14 +188,13 @@ class Planner:
         """Return P, whether an image saturates, and masks of points that face away, for the chosen points."""
         points, normals = self._points[chosen], self._normals[chosen]
         to_left, to_right, to_light = (_unit(centre - points) for centre in centres)
-        distance = np.linalg.norm(centres[2] - points, axis=1)
         light = self._light
-        power = fall_off(light.intensity, distance) if light.fall_off else np.full(len(points), light.intensity)
+        power = self._incident(centres[2], chosen)
         seen = [to_left, to_right] if light.sensing.stereo else [to_left]
         saturated = np.zeros(len(points), dtype=np.bool_)
         probabilities: list[FloatArray] = []
         for to_camera in seen:
-            e = self._radiance(incident_light(power), (to_light, to_camera), chosen)
+            e = self._radiance(power, (to_light, to_camera), chosen)
             clipped = light.response.saturated(e, light.exposure_s)
             z = light.response.intensity(e, light.exposure_s)
             probabilities.append(sensing_probability(z, clipped, light.sensing))
@@ -178,6 +205,13 @@ class Planner:
         )
         p = both_cameras(probabilities[0], probabilities[1]) if light.sensing.stereo else probabilities[0]
         return p, saturated, away
+
+    def _incident(self, projector: FloatArray, chosen: IntArray) -> FloatArray:
+        """Return L_in of equation (1) at the chosen points."""
+        light = self._light
+        if not light.fall_off:
+            return incident_light(np.full(len(chosen), light.intensity))
+        return incident_light(fall_off(light.intensity, np.linalg.norm(projector - self._points[chosen], axis=1)))
 
     def _radiance(self, power: FloatArray, directions: tuple[FloatArray, FloatArray], chosen: IntArray) -> FloatArray:
         """Return radiance, material by material."""
@@ -191,24 +225,16 @@ class Planner:
 
     def _blocked(self, chosen: IntArray, target: FloatArray) -> BoolArray:
         """Say which chosen points a part hides from ``target`` (3,): their own, or another one."""
-        origins = self._points[chosen] + SURFACE_OFFSET_M * self._normals[chosen]
-        blocked = np.zeros(len(chosen), dtype=np.bool_)
-        # the own part stands where this hypothesis says: rays move into its frame, one ray scene serves all
-        starts, ends = origins.copy(), np.broadcast_to(target, origins.shape).copy()
-        for index in np.unique(self._prior_of_point[chosen]):
-            mine = self._prior_of_point[chosen] == index
-            object_T_base = invert(self._priors[index].base_T_object)
-            starts[mine] = transform_points(object_T_base, origins[mine])
-            ends[mine] = transform_points(object_T_base, ends[mine])
-        blocked |= self._alone.blocked(starts, ends)
-        hits = self._together.cast(origins, target - origins)
-        blocked |= (hits.distance < 1.0) & (hits.instance != self._object[chosen])
-        return blocked
+        # the own part stands where this hypothesis says: rays move into its frame, so that one ray scene serves all
+        target_object = (self._object_T_base @ np.append(target, 1.0))[:, :3]
+        blocked = self._alone.blocked(self._starts_object[chosen], target_object[self._prior_of_point[chosen]])
+        hits = self._together.cast(self._starts[chosen], target - self._starts[chosen])
+        return blocked | ((hits.distance < 1.0) & (hits.instance != self._object[chosen]))
 
 
-def _stack(arrays: Sequence[FloatArray] | Sequence[IntArray], columns: int) -> FloatArray:
+def _stack(arrays: Sequence[FloatArray], columns: int) -> FloatArray:
     """Concatenate (N_i, columns); none gives (0, columns)."""
-    return np.concatenate([np.zeros((0, columns)), *arrays]).astype(np.float64)
+    return np.concatenate([np.zeros((0, columns)), *arrays])
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

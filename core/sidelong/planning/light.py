@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from sidelong.errors import SettingsError
 from sidelong.physics.reflectance import PAPER_MATERIALS, Phong
 from sidelong.physics.response import Response
+
+DEFAULT_INTENSITY = 300.0
+"""Of a projector nobody has measured, at 1 m, in saturation exposures per second."""
 
 Share = Annotated[FiniteFloat, Field(ge=0)]
 
@@ -21,7 +23,7 @@ class MaterialSettings(BaseModel):
 
     k_d: Share = Field(description="diffuse share")
     k_s: Share = Field(description="specular share")
-    n: Annotated[FiniteFloat, Field(ge=0, le=1e6, description="glossiness")]
+    n: Annotated[FiniteFloat, Field(ge=0, le=1e6)] = Field(description="glossiness")
 
 
 class LightSettings(BaseModel):
@@ -29,12 +31,15 @@ class LightSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    intensity: Annotated[FiniteFloat, Field(gt=0, description="projector intensity at 1 m, in saturation/s")] = 100.0
-    gamma: Annotated[FiniteFloat, Field(gt=0, le=10, description="response Z = 255 X^(1/gamma)")] = 1.0
+    intensity: Annotated[FiniteFloat, Field(gt=0)] | None = Field(
+        default=None,
+        description="projector intensity at 1 m, in saturation exposures per second; none: fitted where there is a "
+        f"white capture, else {DEFAULT_INTENSITY:g}",
+    )
+    gamma: Annotated[FiniteFloat, Field(gt=0, le=10)] = Field(default=1.0, description="response Z = 255 X^(1/gamma)")
     fall_off: bool = Field(default=True, description="light falls with the squared distance from the projector")
     shadows: Literal["none", "self", "all"] = Field(
-        default="all",
-        description="what may hide a point from cameras and projector: nothing, its own part, all parts",
+        default="all", description="what may hide a point from cameras and projector: nothing, its own part, all parts"
     )
     materials: dict[str, MaterialSettings] = Field(
         default_factory=dict[str, MaterialSettings], description="by name; the paper's three are known"
@@ -59,8 +64,3 @@ class LightSettings(BaseModel):
                 f"light.materials: no reflectance for material {unknown[0]!r}; known are {', '.join(sorted(known))}"
             )
         return tuple(known[name] for name in names)
-
-
-def material_column(reflectances: tuple[Phong, ...], parameter: Literal["k_d", "k_s", "n"]):
-    """Return one parameter of all materials as an array to index by material."""
-    return np.array([getattr(material, parameter) for material in reflectances], dtype=np.float64)

@@ -43,7 +43,7 @@ class RandomView:
 
     def shortlist(self, candidates: Sequence[View], taken: Sequence[View]) -> tuple[View, ...]:
         """Return one candidate, each equally likely."""
-        return (candidates[self._random.integers(len(candidates))],) if candidates else ()
+        return (candidates[int(self._random.integers(len(candidates)))],) if candidates else ()
 
 
 class MaximumDistance:

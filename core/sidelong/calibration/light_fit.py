@@ -1,0 +1,90 @@
+"""The projector's intensity from one capture with a white pattern on parts whose poses are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from sidelong.errors import InputError
+from sidelong.geometry.camera_model import StereoRig
+from sidelong.geometry.mesh import Part
+from sidelong.geometry.transforms import invert
+from sidelong.planning.gain import LightModel, Planner
+from sidelong.planning.prior import believe
+from sidelong.types import DetectedObject, FloatArray, Frame, Hypothesis
+
+USABLE_GREY = (8, 247)
+FEWEST_PIXELS = 200
+"""Pixels between the usable grey levels that one parameter needs; fewer say nothing of the light."""
+
+
+@dataclass(frozen=True)
+class LightFit:
+    """Result of :func:`fit_intensity`.
+
+    Attributes
+    ----------
+    intensity
+        Of the projector at 1 m, in saturation exposures per second.
+    mean_error_grey
+        Mean absolute difference of predicted and measured grey level over the part pixels.
+    pixels
+        How many part pixels were compared.
+    """
+
+    intensity: float
+    mean_error_grey: float
+    pixels: int
+
+
+def fit_intensity(
+    white: Frame, base_T_objects: Sequence[FloatArray], part: Part, rig: StereoRig, light: LightModel
+) -> LightFit:
+    """Fit the one free parameter of the light model: grey levels predicted on the parts against those measured.
+
+    The loss is the mean absolute difference in grey levels, clipping included on both sides, so that saturated and dark
+    pixels say what they can.
+
+    Parameters
+    ----------
+    white
+        Capture with a white pattern.
+    base_T_objects
+        Poses of the parts in it.
+    part, rig, light
+        Geometry and all other parameters of the light model; its intensity is ignored.
+
+    Raises
+    ------
+    InputError
+        Fewer than ``FEWEST_PIXELS`` part pixels are neither black nor saturated.
+    """
+    camera_T_base = invert(white.view.base_T_camera)
+    objects = [DetectedObject((Hypothesis(camera_T_base @ pose, 100.0, 1.0),)) for pose in base_T_objects]
+    everywhere = np.ones(white.left.shape, dtype=np.bool_)
+    belief = believe(objects, part, rig.left, white.view.base_T_camera, everywhere, stride_px=2)
+    planner = Planner(belief, part, rig, replace(light, intensity=1.0))
+    pixels, radiance = planner.left_radiance(white.view)
+    lit = radiance > 0
+    pixels, radiance = pixels[lit], radiance[lit]
+    measured = white.left[pixels[:, 0], pixels[:, 1]].astype(np.float64)
+    usable = int(((measured >= USABLE_GREY[0]) & (measured <= USABLE_GREY[1])).sum())
+    if usable < FEWEST_PIXELS:
+        raise InputError(
+            f"{white.view.name}: {usable} part pixels lie between grey levels {USABLE_GREY[0]} and {USABLE_GREY[1]}, "
+            f"the light intensity needs at least {FEWEST_PIXELS}"
+        )
+
+    def loss(log_intensity: float) -> float:
+        predicted = light.response.intensity(np.exp(log_intensity) * radiance, white.exposure_s)
+        return float(np.abs(predicted - measured).mean())
+
+    # the loss has flat ends (all black, all white) and may have several dips: bracket on a grid first
+    brightest = np.log(light.response.saturation_exposure / (white.exposure_s * radiance.max()))
+    grid = brightest + np.linspace(-4.0, 8.0, 97)
+    start = grid[int(np.argmin([loss(x) for x in grid]))]
+    best = minimize_scalar(loss, bounds=(start - 0.2, start + 0.2), method="bounded")
+    return LightFit(float(np.exp(best.x)), float(best.fun), len(measured))

@@ -1,0 +1,137 @@
+"""Strategies side by side on recorded views: completeness after each view, and against seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from pydantic import BaseModel, ConfigDict
+
+from sidelong.devices import CaptureRequest, Cell
+from sidelong.evaluation.metrics import Truth
+from sidelong.planning.selection import StrategyName, strategy_of
+from sidelong.recipe import GivenObjects, Recipe, Stages
+from sidelong.scan import scan
+from sidelong.stopwatch import Stopwatch
+from sidelong.types import Projector, Step
+
+COMPUTING = ("detect", "score", "fuse")
+"""Stages that cost computing; the others cost the cell's time on a real cell and reading files on a recorded one."""
+
+
+class Row(BaseModel):
+    """State of one run after one more view."""
+
+    model_config = ConfigDict(frozen=True)
+
+    object: str
+    scene: int
+    reference: str
+    strategy: StrategyName
+    seed: int
+    views_added: int
+    view: str | None
+    """None where the run had ended before: the numbers stay as they were."""
+    completeness: float
+    missing_px: int
+    predicted_gain_px: float
+    measured_gain_px: float
+    compute_s: float
+    """Detecting, scoring and fusing, since the start of the run."""
+    cell_s: float
+    """``compute_s`` and the stated time of each capture and move."""
+    stage_s: dict[str, float]
+
+
+@dataclass(frozen=True)
+class CellTime:
+    """What captures and moves cost on a real cell; recorded data cannot tell."""
+
+    move_s: float = 3.0
+    capture_s: float = 0.7
+
+
+@dataclass(frozen=True)
+class Run:
+    """One strategy, with the seed that matters to Random alone."""
+
+    strategy: StrategyName
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Label:
+    """Where rows come from."""
+
+    object: str
+    scene: int
+    reference: str
+
+
+def compare_reference(
+    label: Label,
+    cell: Cell,
+    stages: Stages,
+    recipe: Recipe,
+    truth: Truth,
+    runs: Sequence[Run],
+    time: CellTime = CellTime(),
+) -> Iterator[Row]:
+    """Run each strategy from one reference view and yield a row for each view added.
+
+    The image of the reference view is the same for all, so detection runs once and each run is charged for it.
+    Thresholds of the gain are set aside: every run takes ``recipe.planning.max_views`` views if it can.
+    """
+    watch = Stopwatch()
+    image = cell.camera.capture(CaptureRequest(Projector.OFF, recipe.image_exposure_s), cell.reference.base_T_camera)
+    with watch.stage("detect"):
+        objects = stages.detector.detect(image.left)
+    detect_s = watch.lap()["detect"]
+    for run in runs:
+        planning = recipe.planning.model_copy(
+            update={"strategy": run.strategy, "seed": run.seed, "gain_threshold_px": 0.0, "gain_threshold_share": 0.0}
+        )
+        mine = replace(stages, detector=GivenObjects(objects), strategy=strategy_of(run.strategy, run.seed))
+        steps = scan(cell, mine, recipe.model_copy(update={"planning": planning}), Stopwatch())
+        yield from _rows(label, run, truth, _charged(steps, detect_s), (planning.max_views, time))
+
+
+def _charged(steps: Iterator[Step], detect_s: float) -> Iterator[Step]:
+    """Charge the first step of a run for the detection that all runs share."""
+    for step in steps:
+        yield replace(step, stage_s={**step.stage_s, "detect": detect_s}) if step.index == 0 else step
+
+
+def _rows(label: Label, run: Run, truth: Truth, steps: Iterator[Step], limits: tuple[int, CellTime]) -> Iterator[Row]:
+    """Turn the steps of a run into rows; a run that ended early keeps its last completeness."""
+    max_views, time = limits
+    spent_s, row = 0.0, None
+    for step in steps:
+        # a lap ends with the scores that choose the next view: they are not this view's cost yet
+        compute_s = spent_s + step.stage_s.get("fuse", 0.0)
+        spent_s += sum(step.stage_s.get(stage, 0.0) for stage in COMPUTING)
+        row = Row(
+            object=label.object,
+            scene=label.scene,
+            reference=label.reference,
+            strategy=run.strategy,
+            seed=run.seed,
+            views_added=step.index,
+            view=step.view.name,
+            completeness=truth.completeness(step.depth_m),
+            missing_px=int(truth.missing.sum()),
+            predicted_gain_px=step.predicted_gain_px,
+            measured_gain_px=step.measured_gain_px,
+            compute_s=compute_s,
+            cell_s=compute_s + (step.index + 1) * time.capture_s + step.index * time.move_s,
+            stage_s=dict(step.stage_s),
+        )
+        if step.index > 0:
+            yield row
+    if row is not None:
+        for index in range(row.views_added + 1, max_views + 1):
+            yield row.model_copy(
+                update={
+                    "views_added": index, "view": None, "predicted_gain_px": 0.0, "measured_gain_px": 0.0, "stage_s": {}
+                }
+            )  # fmt: skip
