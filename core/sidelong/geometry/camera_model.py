@@ -25,8 +25,10 @@ class PinholeCamera:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise SettingsError(f"camera: size is {self.width}x{self.height} px, needs at least 1x1")
-        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
+        if not (0 < self.fx < np.inf and 0 < self.fy < np.inf):
             raise SettingsError(f"camera: focal lengths are {self.fx}, {self.fy} px, need positive finite numbers")
+        if not np.isfinite([self.cx, self.cy]).all():
+            raise SettingsError(f"camera: principal point is {self.cx}, {self.cy} px, needs finite numbers")
 
     def scaled(self, factor: float) -> PinholeCamera:
         """Return the camera of the image resized by ``factor`` (area resampling: pixel areas, not centres, scale)."""
@@ -74,6 +76,11 @@ class LightProjector:
     left_T_projector: FloatArray
     half_width_rad: float
     half_height_rad: float
+
+    def __post_init__(self) -> None:
+        for name, angle in (("half_width_rad", self.half_width_rad), ("half_height_rad", self.half_height_rad)):
+            if not 0 < angle < np.pi / 2:
+                raise SettingsError(f"projector: {name} is {angle} rad, limits 0 to pi/2")
 
     def lights(self, points_projector: FloatArray) -> BoolArray:
         """Say which points (..., 3) in the projector's frame lie in its cone."""

@@ -17,6 +17,9 @@ METRES_PER_UNIT = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 25.4e-3}
 SMALLEST_PART_M, LARGEST_PART_M = 0.5e-3, 5.0
 """Largest extents of a part a cell handles; a file outside them is in another unit than it says."""
 
+SMALLEST_FILL = 1e-12
+"""Least volume relative to the cube of the largest extent: a wire of 1 m and 10 um still passes."""
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -77,8 +80,9 @@ def part_from_arrays(
     Raises
     ------
     MeshError
-        The mesh is empty, has coordinates that are not finite, is not watertight, or its largest extent lies outside
-        ``SMALLEST_PART_M`` to ``LARGEST_PART_M``.
+        The mesh is empty, has coordinates that are not finite or triangles without vertex or material, is not
+        watertight, is wound inconsistently, encloses no volume, or its largest extent lies outside
+        ``SMALLEST_PART_M`` to ``LARGEST_PART_M``. A mesh that is inside out as a whole is turned.
     """
     import trimesh
 
@@ -86,6 +90,7 @@ def part_from_arrays(
         raise MeshError(f"{name}: the mesh is empty ({len(vertices_m)} vertices, {len(triangles)} triangles)")
     if not np.isfinite(vertices_m).all():
         raise MeshError(f"{name}: {int((~np.isfinite(vertices_m)).sum())} vertex coordinates are not finite")
+    _check_triangles(name, triangles, len(vertices_m), triangle_material, len(materials))
     extent_m = float(np.ptp(vertices_m, axis=0).max())
     if not SMALLEST_PART_M <= extent_m <= LARGEST_PART_M:
         likely = "metres" if extent_m < SMALLEST_PART_M else "a smaller unit than declared"
@@ -100,11 +105,42 @@ def part_from_arrays(
         raise MeshError(
             f"{name}: the mesh is not watertight, {open_edges} edges have not exactly two triangles, limit 0"
         )
-    if mesh.volume < 0:
+    if not mesh.is_winding_consistent:
+        raise MeshError(
+            f"{name}: neighbouring triangles are wound against each other: outside and inside are not clear"
+        )
+    volume_m3 = _signed_volume(vertices_m, triangles)
+    if abs(volume_m3) < SMALLEST_FILL * extent_m**3:
+        raise MeshError(f"{name}: the mesh is flat, it encloses {abs(volume_m3) * 1e9:.3g} mm3")
+    if volume_m3 < 0:
         triangles = np.ascontiguousarray(triangles[:, ::-1])
     if triangle_material is None:
         triangle_material = np.zeros(len(triangles), dtype=np.intp)
     return Part(name, np.asarray(vertices_m, dtype=np.float64), triangles, triangle_material, materials)
+
+
+def _check_triangles(
+    name: str, triangles: IntArray, vertex_count: int, triangle_material: IntArray | None, material_count: int
+) -> None:
+    if triangles.min() < 0 or triangles.max() >= vertex_count:
+        raise MeshError(
+            f"{name}: triangles refer to vertices {triangles.min()} to {triangles.max()}, the mesh has {vertex_count}"
+        )
+    if triangle_material is None:
+        return
+    if len(triangle_material) != len(triangles):
+        raise MeshError(f"{name}: {len(triangle_material)} material indices for {len(triangles)} triangles")
+    if triangle_material.min() < 0 or triangle_material.max() >= material_count:
+        raise MeshError(
+            f"{name}: material indices run from {triangle_material.min()} to {triangle_material.max()}, "
+            f"there are {material_count} materials"
+        )
+
+
+def _signed_volume(vertices_m: FloatArray, triangles: IntArray) -> float:
+    """Sum the tetrahedra from the first vertex to each triangle: positive where the triangles face outwards."""
+    a, b, c = np.moveaxis(vertices_m[triangles] - vertices_m[0], 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
 
 
 def load_part(path: Path) -> Part:
@@ -136,6 +172,7 @@ def load_part(path: Path) -> Part:
     if len(triangles) == 0:
         raise MeshError(f"{path}: the mesh is empty (0 triangles)")
     unit, triangle_material, materials = _read_materials(path.with_suffix(".json"), len(triangles))
+    _check_triangles(str(path), triangles, len(vertices), triangle_material, len(materials))
     vertices, inverse = np.unique(vertices, axis=0, return_inverse=True)
     welded = inverse.reshape(-1)[triangles]
     try:
@@ -163,6 +200,8 @@ def _read_materials(path: Path, triangle_count: int) -> tuple[str, IntArray, tup
     for first, last, name in ranges:
         if not 0 <= first < last <= triangle_count:
             raise MeshError(f"{path}: face range {first}..{last} lies outside 0..{triangle_count}")
+        if (index[first:last] >= 0).any():
+            raise MeshError(f"{path}: face range {first}..{last} overlaps another")
         index[first:last] = materials.index(name)
     if (index < 0).any():
         raise MeshError(f"{path}: {int((index < 0).sum())} of {triangle_count} faces have no material")

@@ -70,7 +70,10 @@ class RayScene:
 
         self._core = o3d.core
         self._scene: Any = o3d.t.geometry.RaycastingScene()
-        self._normals = [rotate(scene_T_object, part.triangle_normals) for part, scene_T_object in parts]
+        self._normals = np.concatenate(
+            [np.zeros((0, 3)), *(rotate(scene_T_object, part.triangle_normals) for part, scene_T_object in parts)]
+        )
+        self._first_triangle = np.cumsum([0, *(len(part.triangles) for part, _ in parts)])
         for part, scene_T_object in parts:
             self._scene.add_triangles(
                 self._tensor(transform_points(scene_T_object, part.vertices_m)),
@@ -90,7 +93,7 @@ class RayScene:
         """
         origins, directions = np.broadcast_arrays(origins, directions)
         shape = directions.shape[:-1]
-        if not self._normals or directions.size == 0:
+        if not len(self._normals) or directions.size == 0:
             nowhere = np.full(shape, -1, dtype=np.intp)
             return Hits(np.full(shape, np.inf), nowhere, nowhere.copy(), np.full((*shape, 3), np.nan))
         answer = self._scene.cast_rays(self._tensor(np.concatenate([origins, directions], axis=-1)))
@@ -99,16 +102,14 @@ class RayScene:
         instance = np.where(hit, answer["geometry_ids"].numpy().astype(np.int64), -1)
         triangle = np.where(hit, answer["primitive_ids"].numpy().astype(np.int64), -1)
         normals = np.full((*shape, 3), np.nan)
-        for index, part_normals in enumerate(self._normals):
-            mine = instance == index
-            normals[mine] = part_normals[triangle[mine]]
+        normals[hit] = self._normals[self._first_triangle[instance[hit]] + triangle[hit]]
         return Hits(distance, instance, triangle, normals)
 
     def blocked(self, origins: FloatArray, targets: FloatArray) -> BoolArray:
         """Say which segments (..., 3) to (..., 3) meet the scene; start them ``SURFACE_OFFSET_M`` above a surface."""
         origins, targets = np.broadcast_arrays(origins, targets)
         shape = origins.shape[:-1]
-        if not self._normals or origins.size == 0:
+        if not len(self._normals) or origins.size == 0:
             return np.zeros(shape, dtype=np.bool_)
         rays = self._tensor(np.concatenate([origins, targets - origins], axis=-1))
         return self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0).numpy()

@@ -40,8 +40,9 @@ def validated_transform(matrix: ArrayLike, name: str) -> FloatArray:
     if np.abs(a_T_b[3] - (0.0, 0.0, 0.0, 1.0)).max() > ORTHONORMAL_TOLERANCE:
         raise PoseError(f"{name}: the last row of the pose is {a_T_b[3].tolist()}, should be [0, 0, 0, 1]")
     rotation = a_T_b[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > ORTHONORMAL_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not error <= ORTHONORMAL_TOLERANCE:  # entries of 1e200 make it NaN
         raise PoseError(
             f"{name}: the rotation is not orthonormal, |R R^T - I| is {error:.3g}, limit {ORTHONORMAL_TOLERANCE:g}"
         )
@@ -91,7 +92,7 @@ def rotation_about(axis: ArrayLike, angle_rad: float) -> FloatArray:
     """
     direction = np.asarray(axis, dtype=np.float64)
     length = float(np.linalg.norm(direction))
-    if not length > 0:
+    if not 0 < length < np.inf:
         raise PoseError(f"axis: {direction.tolist()} has no direction")
     x, y, z = direction / length
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -115,13 +116,13 @@ def look_at(eye_m: ArrayLike, target_m: ArrayLike, roll_rad: float = 0.0) -> Flo
     Raises
     ------
     PoseError
-        Eye and target coincide.
+        Eye and target coincide, or are not finite.
     """
-    eye = np.asarray(eye_m, dtype=np.float64)
-    forward = np.asarray(target_m, dtype=np.float64) - eye
+    eye, target = np.asarray(eye_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
+    forward = target - eye
     length = float(np.linalg.norm(forward))
-    if not length > 0:
-        raise PoseError(f"look_at: eye and target are the same point {eye.tolist()} m")
+    if not 0 < length < np.inf:
+        raise PoseError(f"look_at: there is no direction from eye {eye.tolist()} m to target {target.tolist()} m")
     forward /= length
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(right) < 1e-9 else right / np.linalg.norm(right)

@@ -7,26 +7,26 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from sidelong.errors import SettingsError
 from sidelong.geometry.mesh import Part, part_from_arrays
-from sidelong.geometry.transforms import rotate, rotation_about, transform
+from sidelong.geometry.transforms import rotation_about, transform, transform_points
 from sidelong.simulation.lofting import joined, loft, rectangle_ring
 from sidelong.types import FloatArray
 
 GAP_M = 1.5e-3
 """Least distance between the footprints of two parts, and of a part and a wall."""
 TRIES_PER_PART = 400
-"""Random places tried for a part before the bin counts as full."""
+"""Random places tried for one part before the bin counts as full."""
 
 
 class Bin(BaseModel):
-    """An open box, its floor at z = 0 and centred on the z axis of its own frame, on a table a floor's thickness below."""
+    """An open box, its floor at z = 0 and centred on the z axis of its own frame, on a table."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    length_m: FiniteFloat = Field(0.30, gt=0.02, le=2.0, description="inner length along x")
-    width_m: FiniteFloat = Field(0.22, gt=0.02, le=2.0, description="inner width along y")
-    height_m: FiniteFloat = Field(0.04, gt=0.0, le=1.0, description="height of the walls above the floor")
-    wall_m: FiniteFloat = Field(0.004, ge=0.0005, le=0.1, description="thickness of walls and floor")
-    table_m: FiniteFloat = Field(1.4, gt=0.05, le=4.0, description="side of the square table the bin stands on")
+    length_m: FiniteFloat = Field(default=0.30, gt=0.02, le=2.0, description="inner length along x")
+    width_m: FiniteFloat = Field(default=0.22, gt=0.02, le=2.0, description="inner width along y")
+    height_m: FiniteFloat = Field(default=0.04, gt=0.0, le=1.0, description="height of the walls above the floor")
+    wall_m: FiniteFloat = Field(default=0.004, ge=0.0005, le=0.1, description="thickness of walls and floor")
+    table_m: FiniteFloat = Field(default=1.4, gt=0.05, le=4.0, description="side of the square table the bin stands on")
 
     def part(self) -> Part:
         """Return box and table as one matte part (two closed shells that share a plane nobody sees)."""
@@ -77,22 +77,25 @@ def fill_bin(part: Part, count: int, seed: int, base_T_bin: FloatArray, bin_: Bi
     resting, likelihood = resting_rotations(part)
     hull_m = _hull_vertices(part)
     half_m = np.array([bin_.length_m, bin_.width_m]) / 2 - GAP_M
-    placed: list[tuple[FloatArray, FloatArray]] = []
-    for _ in range(count * TRIES_PER_PART):
-        if len(placed) == count:
-            break
+    footprints: list[FloatArray] = []
+    bin_T_objects: list[FloatArray] = []
+    tries = 0
+    while len(bin_T_objects) < count:
+        if tries == TRIES_PER_PART:
+            raise SettingsError(
+                f"bin count: {count} x {part.name} do not fit side by side into "
+                f"{bin_.length_m:g} x {bin_.width_m:g} m, {len(bin_T_objects)} did (seed {seed})"
+            )
+        tries += 1
         bin_T_object = _dropped(resting[rng.choice(len(resting), p=likelihood)], hull_m, half_m, rng)
         if bin_T_object is None:
             continue
-        footprint = convex_outline((hull_m @ bin_T_object[:3, :3].T + bin_T_object[:3, 3])[:, :2])
-        if all(outline_distance(footprint, other) >= GAP_M for other, _ in placed):
-            placed.append((footprint, bin_T_object))
-    if len(placed) < count:
-        raise SettingsError(
-            f"bin count: {count} x {part.name} do not fit side by side into {bin_.length_m:g} x {bin_.width_m:g} m, "
-            f"{len(placed)} did (seed {seed}); take fewer or a larger bin"
-        )
-    return [base_T_bin @ bin_T_object for _, bin_T_object in placed]
+        footprint = convex_outline(transform_points(bin_T_object, hull_m)[:, :2])
+        if all(outline_distance(footprint, other) >= GAP_M for other in footprints):
+            footprints.append(footprint)
+            bin_T_objects.append(bin_T_object)
+            tries = 0
+    return [base_T_bin @ bin_T_object for bin_T_object in bin_T_objects]
 
 
 def resting_rotations(part: Part) -> tuple[FloatArray, FloatArray]:
@@ -110,7 +113,8 @@ def resting_rotations(part: Part) -> tuple[FloatArray, FloatArray]:
     normals = np.asarray(hull.face_normals, dtype=np.float64)
     solid_angles = _solid_angles(corners)
     faces = np.unique(np.round(normals, 3), axis=0, return_inverse=True)[1].reshape(-1)
-    rotations, likelihood = [], []
+    rotations: list[FloatArray] = []
+    likelihood: list[float] = []
     for face in range(int(faces.max()) + 1):
         mine = faces == face
         normal = normals[mine][0]

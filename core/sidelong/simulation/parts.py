@@ -1,4 +1,4 @@
-"""The parts of the simulated cell: made of rings, watertight, sized like those of the ROBI data set (3 to 7 cm).
+"""The parts of the simulated cell: made of rings, watertight, sized like those of the ROBI data set (3 to 8 cm).
 
 Each stands along the z axis of its own frame, whose origin is the centre of its bounding box. Normals decide where a
 highlight falls, so curved faces are cut finely: no facet turns by more than 4 degrees about the axis.
@@ -54,17 +54,16 @@ def _tube_fitting() -> Mesh:
 
 
 def _hex_screw() -> Mesh:
-    """An M10 x 40 screw; its thread is a stack of ridges."""
-    return loft([*_hexagon_prism(0.0, 6.4, across_flats=17.0), *_cylinder(6.4, 14.0, 5.0), *_thread(14.0, 46.0, 5.0)])
+    """An M16 x 50 screw; its thread is a stack of ridges."""
+    return loft([*_hexagon_prism(0.0, 10.0, across_flats=24.0), *_cylinder(10.0, 32.0, 8.0), *_thread(32.0, 60.0, 8.0)])
 
 
 def _eye_bolt() -> Mesh:
-    """A ring on a collar and a threaded shank, 70 mm: two closed shells that overlap."""
-    shank = [*_thread(0.0, 24.0, 5.0), *_cylinder(24.0, 27.0, 5.0), *_cylinder(27.0, 32.0, 9.5)]
-    across_mm = 16.0 + polar_ring(4.5, 0.0, 48)[:, 0]
-    along_mm = polar_ring(4.5, 0.0, 48)[:, 1]
+    """A ring on a collar and a threaded shank, 77 mm: two closed shells that overlap."""
+    shank = [*_thread(0.0, 20.0, 7.0), *_cylinder(20.0, 24.0, 7.0), *_cylinder(24.0, 29.0, 11.0)]
+    across_mm, along_mm = (polar_ring(6.5, 0.0, 48)[:, :2] + (18.0, 0.0)).T
     turns = ring_angles_rad(RING_POINTS)
-    ring = [np.stack([across_mm * np.cos(t), along_mm, 49.5 + across_mm * np.sin(t)], axis=-1) for t in turns]
+    ring = [np.stack([across_mm * np.cos(t), along_mm, 52.0 + across_mm * np.sin(t)], axis=-1) for t in turns]
     return joined([loft(shank), loft(ring, cyclic=True)])
 
 
@@ -95,18 +94,21 @@ def _hexagon_prism(z_from: float, z_to: float, across_flats: float) -> list[Floa
     """Rings of a hexagon whose corners are turned off by a 30 degree cone, as on every nut."""
     from_flat_rad = ring_angles_rad(RING_POINTS) % (np.pi / 3) - np.pi / 6
     hexagon = across_flats / 2 / np.cos(from_flat_rad)
-    turned_mm = np.linspace(0.0, hexagon.max() - across_flats / 2, 4)
-    height_mm = turned_mm * np.tan(np.pi / 6)
-    start = [np.minimum(hexagon, across_flats / 2 + turned) for turned in turned_mm]
-    rings = [polar_ring(radius, z_from + height, RING_POINTS) for radius, height in zip(start, height_mm, strict=True)]
-    ends = [polar_ring(radius, z_to - height, RING_POINTS) for radius, height in zip(start, height_mm, strict=True)]
-    return rings + ends[::-1]
+    deepest_mm = float(hexagon.max()) - across_flats / 2
+    starts: list[FloatArray] = []
+    ends: list[FloatArray] = []
+    for turned_mm in (deepest_mm * share for share in (0.0, 1 / 3, 2 / 3, 1.0)):
+        radius = np.minimum(hexagon, across_flats / 2 + turned_mm)
+        height_mm = turned_mm * float(np.tan(np.pi / 6))
+        starts.append(polar_ring(radius, z_from + height_mm, RING_POINTS))
+        ends.insert(0, polar_ring(radius, z_to - height_mm, RING_POINTS))
+    return starts + ends
 
 
-def _thread(z_from: float, z_to: float, radius: float, pitch: float = 1.5) -> list[FloatArray]:
-    """Rings of a thread's profile without its lead: 60 degree ridges."""
+def _thread(z_from: float, z_to: float, radius: float, pitch: float = 2.0) -> list[FloatArray]:
+    """Rings of a thread's profile without its lead: shallow ridges."""
     heights = np.arange(z_from, z_to, pitch / 2)
-    depth = np.where(np.arange(len(heights)) % 2 == 0, 0.54 * pitch, 0.0)
+    depth = np.where(np.arange(len(heights)) % 2 == 0, 0.4 * pitch, 0.0)
     return [polar_ring(radius - d, z, RING_POINTS) for d, z in zip(depth, heights, strict=True)]
 
 

@@ -45,7 +45,7 @@ def test_without_normals_beyond_a_right_angle_the_diffuse_share_is_refused() -> 
 
 
 def test_a_perfectly_matte_surface_has_no_glossiness() -> None:
-    with pytest.raises(InputError, match="not identifiable|no highlight"):
+    with pytest.raises(InputError, match=r"not identifiable|no highlight"):
         fit_two_stage(*samples(Phong(k_d=0.4, k_s=0.0, n=1.0)))
 
 
