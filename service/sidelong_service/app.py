@@ -1,0 +1,246 @@
+"""The HTTP interface. This process imports neither open3d nor a vendor's client: see the README's map."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, cast
+from uuid import uuid4
+
+from fastapi import Depends, FastAPI, Header, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import FileResponse, JSONResponse
+from pydantic import ValidationError
+from sse_starlette import EventSourceResponse
+from starlette.exceptions import HTTPException
+
+from sidelong_service.events import follow, sse
+from sidelong_service.models import (
+    ArtifactList,
+    CellReport,
+    Limit,
+    Readiness,
+    Scan,
+    ScanList,
+    ScanRequest,
+    StopReport,
+)
+from sidelong_service.problems import MEDIA_TYPE, Problem, ServiceError, problem, validation_problem
+from sidelong_service.settings import ServiceSettings
+from sidelong_service.storage import Storage
+from sidelong_service.storage_thread import StorageThread
+from sidelong_service.supervisor import Supervisor
+
+LARGEST_BODY = 256 * 1024
+PING_S = 15
+
+
+@dataclass(frozen=True, eq=False)
+class Service:
+    """What the routes work with."""
+
+    settings: ServiceSettings
+    storage: StorageThread
+    supervisor: Supervisor
+    loop: asyncio.AbstractEventLoop
+
+
+def create_app(settings: ServiceSettings) -> FastAPI:
+    """Return the application; its lifespan starts and ends the other processes."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncGenerator[None]:
+        storage = StorageThread(settings.data_dir / "sidelong.sqlite")
+        await storage.open()
+        supervisor = Supervisor(settings, storage, new_id=lambda: uuid4().hex)
+        app.state.service = Service(settings, storage, supervisor, asyncio.get_running_loop())
+        await supervisor.start()
+        try:
+            yield
+        finally:
+            await supervisor.close()
+            await storage.close()
+
+    app = FastAPI(
+        title="sidelong",
+        version="1",
+        summary="Next-best-view depth completion for shiny parts",
+        lifespan=lifespan,
+        # the usual pages load scripts from other hosts
+        docs_url=None,
+        redoc_url=None,
+    )
+    _add_scan_routes(app)
+    _add_cell_routes(app)
+    _add_problem_handlers(app)
+    app.openapi = lambda: _openapi(app)
+    return app
+
+
+def service_of(request: Request) -> Service:
+    """Return what the lifespan made."""
+    return cast("Service", request.app.state.service)
+
+
+async def scan_request(request: Request) -> ScanRequest:
+    """Read the body as strict JSON: NaN, 1e999, booleans for numbers and unknown fields are errors."""
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type != "application/json":
+        raise ServiceError(problem("media-type", f"The body's media type is {media_type or 'not given'!r}."))
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > LARGEST_BODY:
+            raise ServiceError(problem("too-large", f"The body has more than {LARGEST_BODY} bytes."))
+    try:
+        return ScanRequest.model_validate_json(bytes(body))
+    except ValidationError as error:
+        raise ServiceError(validation_problem(cast("Any", error.errors()))) from error
+
+
+async def found_scan(scan_id: str, service: Annotated[Service, Depends(service_of)]) -> Scan:
+    """Return the scan of the path."""
+    scan = await service.storage.call(Storage.scan, scan_id)
+    if scan is None:
+        raise ServiceError(problem("not-found", f"There is no scan {scan_id!r:.80}."))
+    return scan
+
+
+TheService = Annotated[Service, Depends(service_of)]
+FoundScan = Annotated[Scan, Depends(found_scan)]
+
+
+def _documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    schema = {"$ref": "#/components/schemas/Problem"}
+    return {
+        status: {"description": "A problem", "content": {MEDIA_TYPE: {"schema": schema}}} for status in statuses
+    }  # fmt: skip
+
+
+def _add_scan_routes(app: FastAPI) -> None:
+    body = {"required": True, "content": {"application/json": {"schema": {"$ref": "#/components/schemas/ScanRequest"}}}}
+
+    @app.post(
+        "/v1/scans",
+        status_code=202,
+        response_model=Scan,
+        responses=_documented(404, 409, 413, 415, 422, 503),
+        openapi_extra={"requestBody": body},
+    )
+    async def start_scan(
+        wanted: Annotated[ScanRequest, Depends(scan_request)], service: TheService, response: Response
+    ) -> Scan | None:
+        """Accept a scan; it runs by itself, its course is told under the Location."""
+        scan_id = await service.supervisor.submit(wanted)
+        response.headers["Location"] = f"/v1/scans/{scan_id}"
+        return await service.storage.call(Storage.scan, scan_id)
+
+    @app.get("/v1/scans", response_model=ScanList, responses=_documented(422))
+    async def list_scans(
+        service: TheService,
+        limit: Limit = 50,
+        cursor: Annotated[int | None, Query(ge=1, lt=2**63)] = None,
+    ) -> ScanList:
+        """List scans, newest first."""
+        return await service.storage.call(Storage.scans, limit, cursor)
+
+    @app.get("/v1/scans/{scan_id}", response_model=Scan, responses=_documented(404))
+    async def show_scan(scan: FoundScan) -> Scan:
+        """Show a scan with its views so far."""
+        return scan
+
+    @app.get("/v1/scans/{scan_id}/events", response_class=EventSourceResponse, responses=_documented(404, 422))
+    async def follow_scan(
+        scan: FoundScan,
+        service: TheService,
+        last_event_id: Annotated[int, Header(ge=0, lt=2**63)] = 0,
+    ) -> EventSourceResponse:
+        """Tell the course of a scan, from the start or after ``Last-Event-ID``, until it has ended."""
+        events = follow(service.storage, service.supervisor.bulletin, scan.id, last_event_id)
+        return EventSourceResponse((sse(event) async for event in events), ping=PING_S)
+
+    @app.get("/v1/scans/{scan_id}/artifacts", response_model=ArtifactList, responses=_documented(404))
+    async def list_artifacts(scan: FoundScan) -> ArtifactList:
+        """List the files of a scan."""
+        return ArtifactList(artifacts=scan.artifacts)
+
+    @app.get("/v1/scans/{scan_id}/artifacts/{name}", response_class=FileResponse, responses=_documented(404))
+    async def read_artifact(scan: FoundScan, name: str, service: TheService) -> FileResponse:
+        """Read a file of a scan."""
+        artifact = next((artifact for artifact in scan.artifacts if artifact.name == name), None)
+        if artifact is None:
+            raise ServiceError(problem("not-found", f"Scan {scan.id} has no file {name!r:.80}.", scan_id=scan.id))
+        path: Path = service.settings.data_dir / "scans" / scan.id / artifact.name
+        headers = {"ETag": f'"{artifact.sha256}"', "X-Content-Type-Options": "nosniff"}
+        return FileResponse(path, media_type=artifact.media_type, headers=headers)
+
+
+def _add_cell_routes(app: FastAPI) -> None:
+    @app.get("/v1/cell", response_model=CellReport)
+    async def show_cell(service: TheService) -> CellReport:
+        """Show the cell, and whether a scan may start now."""
+        return service.supervisor.cell()
+
+    @app.post("/v1/cell/stop", response_model=StopReport, responses=_documented(504))
+    async def stop_cell(service: TheService) -> StopReport:
+        """Stop the arm at once, and the active scan; harmless when repeated."""
+        return StopReport(scan=await service.supervisor.stop())
+
+    @app.get("/livez")
+    async def live() -> dict[str, str]:
+        """Say that the process answers."""
+        return {"status": "alive"}
+
+    @app.get("/readyz", response_model=Readiness, responses={503: {"model": Readiness}})
+    async def ready(service: TheService, response: Response) -> Readiness:
+        """Say whether a scan has all it needs."""
+        readiness = await service.supervisor.readiness()
+        response.status_code = 200 if readiness.ready else 503
+        return readiness
+
+
+def _add_problem_handlers(app: FastAPI) -> None:
+    @app.exception_handler(ServiceError)
+    async def on_service_error(_request: Request, error: ServiceError) -> Response:
+        return _answer(error.problem)
+
+    @app.exception_handler(RequestValidationError)
+    async def on_validation_error(_request: Request, error: RequestValidationError) -> Response:
+        return _answer(validation_problem(error.errors()))
+
+    @app.exception_handler(HTTPException)
+    async def on_http_error(request: Request, error: HTTPException) -> Response:
+        kinds = {404: "not-found", 405: "method-not-allowed"}
+        kind = kinds.get(error.status_code, "bad-request")
+        return _answer(problem(kind, f"{request.method} {request.url.path:.200}"), error.headers)
+
+    @app.exception_handler(Exception)
+    async def on_unexpected_error(_request: Request, _error: Exception) -> Response:
+        # the server logs the trace; the caller learns nothing of what is inside
+        return _answer(problem("internal", "An unexpected error; the service's log has its trace."))
+
+
+def _answer(trouble: Problem, headers: Any = None) -> JSONResponse:
+    given = dict(headers or {})
+    if trouble.retryable and trouble.status == 503:
+        given["Retry-After"] = "1"
+    content = trouble.model_dump(mode="json", exclude_none=True)
+    return JSONResponse(content, trouble.status, given, media_type=MEDIA_TYPE)
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """Return the document with the models that the routes read and answer by themselves."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+        schemas = document.setdefault("components", {}).setdefault("schemas", {})
+        for model in (ScanRequest, Problem):
+            schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas.update(schema.pop("$defs", {}))
+            schemas[model.__name__] = schema
+        app.openapi_schema = json.loads(json.dumps(document))
+    return app.openapi_schema or {}

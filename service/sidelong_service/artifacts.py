@@ -1,0 +1,189 @@
+"""The files of a scan: each written whole or not at all, with its checksum."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sidelong.geometry.camera_model import PinholeCamera
+from sidelong.geometry.transforms import transform_points
+from sidelong.types import FloatArray, GrayImage, Step
+from sidelong_service.models import Artifact, Setup, ViewReport
+
+DEPTH_UNIT_M = 1e-4
+"""Of the 16-bit depth picture: 0.1 mm reaches 6.5 m, and is a sixth of what the sensor repeats to at 0.7 m."""
+LARGEST_PNG_DEPTH_M = 65535 * DEPTH_UNIT_M
+
+MEDIA_TYPES = {".png": "image/png", ".npz": "application/octet-stream", ".ply": "application/octet-stream",
+               ".json": "application/json"}  # fmt: skip
+
+
+@dataclass
+class Record:
+    """What a scan has gathered so far.
+
+    Attributes
+    ----------
+    camera
+        Intrinsics of the reference view.
+    setup
+        What the scan runs with.
+    recipe
+        The effective settings, as JSON.
+    image
+        Reference image with the projector off.
+    views
+        One report a view.
+    first, last
+        The reference step, and the latest.
+    """
+
+    camera: PinholeCamera
+    setup: Setup
+    recipe: dict[str, Any]
+    image: GrayImage | None = None
+    views: list[ViewReport] = field(default_factory=list[ViewReport])
+    first: Step | None = None
+    last: Step | None = None
+
+    def add(self, step: Step) -> ViewReport:
+        """Take a step in and return its report."""
+        self.first, self.last = self.first or step, step
+        report = ViewReport.of(step)
+        self.views.append(report)
+        return report
+
+
+def write_view(folder: Path, step: Step) -> Artifact:
+    """Write what one view measured, as soon as it has: no later failure loses it."""
+    arrays: dict[str, Any] = {"left": step.frame.left, "base_T_camera": step.view.base_T_camera}
+    if step.frame.depth_m is not None:
+        arrays["depth_m"] = step.frame.depth_m.astype(np.float32)
+    return _write(folder / f"view_{step.index:02d}.npz", _npz(arrays))
+
+
+def write_results(folder: Path, record: Record, draw: Callable[[Record], bytes]) -> list[Artifact]:
+    """Write the completed depth and all that goes with it; nothing where there is no reference view yet."""
+    step = record.last
+    if step is None:
+        return []
+    contents = {
+        "depth.png": depth_png(step.depth_m),
+        "depth.npz": _depth_npz(step, record),
+        "cloud.ply": _cloud(step, record),
+        "picture.png": draw(record),
+        "report.json": _report(step, record),
+    }
+    return [_write(folder / name, content) for name, content in contents.items()]
+
+
+def depth_png(depth_m: FloatArray) -> bytes:
+    """Return depth (H, W) as a 16-bit PNG in units of ``DEPTH_UNIT_M``; 0 where missing or beyond its range."""
+    import cv2
+
+    held = np.isfinite(depth_m) & (depth_m <= LARGEST_PNG_DEPTH_M)
+    units = np.where(held, np.rint(depth_m / DEPTH_UNIT_M), 0).astype(np.uint16)
+    return cv2.imencode(".png", units)[1].tobytes()
+
+
+def ply(points_m: FloatArray, gray: GrayImage) -> bytes:
+    """Return points (N, 3) with a gray value (N,) each as a binary PLY file."""
+    header = [
+        "ply", "format binary_little_endian 1.0", "comment metres, base frame", f"element vertex {len(points_m)}",
+        *(f"property float {axis}" for axis in "xyz"), *(f"property uchar {c}" for c in ("red", "green", "blue")),
+        "end_header",
+    ]  # fmt: skip
+    vertices = np.empty(len(points_m), dtype=[("point", "<f4", 3), ("colour", "u1", 3)])
+    vertices["point"], vertices["colour"] = points_m, gray[:, None]
+    return ("\n".join(header) + "\n").encode() + vertices.tobytes()
+
+
+def _cloud(step: Step, record: Record) -> bytes:
+    measured = np.isfinite(step.depth_m)
+    points_camera = record.camera.pixel_rays()[measured] * step.depth_m[measured][:, None]
+    image = record.image if record.image is not None else step.frame.left
+    return ply(transform_points(_reference(record).view.base_T_camera, points_camera), image[measured])
+
+
+def _depth_npz(step: Step, record: Record) -> bytes:
+    return _npz(
+        {
+            "depth_m": step.depth_m,
+            "source": step.source.astype(np.int16),
+            "K": _intrinsics(record.camera),
+            "base_T_camera": _reference(record).view.base_T_camera,
+            "views": np.array([view.view for view in record.views]),
+        }
+    )
+
+
+def _report(step: Step, record: Record) -> bytes:
+    beyond_px = int((step.depth_m > LARGEST_PNG_DEPTH_M).sum())
+    document = {
+        "finish_reason": step.stop,
+        "completeness": step.completeness,
+        "missing_px": step.missing_px,
+        "recovered_px": step.recovered_px,
+        "setup": record.setup.model_dump(mode="json"),
+        "views": [view.model_dump(mode="json") for view in record.views],
+        "recipe": record.recipe,
+        "K": _intrinsics(record.camera).tolist(),
+        "base_T_camera": _reference(record).view.base_T_camera.tolist(),
+        "depth_png": {
+            "unit_m": DEPTH_UNIT_M,
+            "missing": 0,
+            "largest_m": LARGEST_PNG_DEPTH_M,
+            "beyond_largest_px": beyond_px,
+        },
+    }
+    return json.dumps(document, indent=1, allow_nan=False).encode()
+
+
+def _reference(record: Record) -> Step:
+    if record.first is None:
+        raise ValueError("the record has no reference view yet")
+    return record.first
+
+
+def _intrinsics(camera: PinholeCamera) -> FloatArray:
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def _npz(arrays: dict[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def _write(path: Path, content: bytes) -> Artifact:
+    """Write a file under another name, then rename it: it is there whole, or not at all, even after a power cut."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.part")
+    try:
+        with draft.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+    return Artifact(
+        name=path.name,
+        media_type=MEDIA_TYPES[path.suffix],
+        size_bytes=len(content),
+        sha256=hashlib.sha256(content).hexdigest(),
+    )

@@ -1,0 +1,118 @@
+"""Makes cells of what a job names: the configured one, or recorded views."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from sidelong.evaluation.dataset import Dataset
+from sidelong_drivers.registry import create_camera
+
+from sidelong.devices import Arm, Camera, Cell
+from sidelong.errors import UnknownNameError
+from sidelong.geometry.mesh import Part, load_part
+from sidelong.geometry.transforms import validated_transform
+from sidelong.planning.candidates import dome_views
+from sidelong.recipe import Recipe
+from sidelong.simulation.parts import simulated_part
+from sidelong.types import View
+from sidelong_service.messages import CellJob, Job, RecordingJob
+from sidelong_service.settings import CellSettings, DriverSettings
+
+CAD_SUFFIXES = (".stl", ".obj", ".ply", ".off")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a job names, found and checked: everything but the devices."""
+
+    camera: DriverSettings
+    part: Part
+    flange_T_camera: tuple[float, ...]
+    reference: View
+    candidates: tuple[View, ...]
+
+
+def plan_of(job: Job, recipe: Recipe) -> Plan:
+    """Find all that a job names. Nothing is opened and nothing moves.
+
+    Raises
+    ------
+    InputError
+        A name is unknown, a file cannot be used, or the recipe has no reflectance for the part.
+    """
+    plan = _cell_plan(job) if isinstance(job, CellJob) else _recording_plan(job)
+    recipe.light.reflectances(plan.part.materials)
+    return plan
+
+
+class Cameras:
+    """Opens cameras. The configured one stays open from scan to scan, unless it failed."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[DriverSettings, Camera] | None = None
+
+    def open(self, driver: DriverSettings) -> Camera:
+        """Return the open camera; the one that was open before is closed if it is another.
+
+        Raises
+        ------
+        DeviceUnavailableError
+            It cannot be opened.
+        InputError
+            Its settings are out of range, or name what is not there.
+        """
+        if self._kept is not None and self._kept[0] == driver:
+            return self._kept[1]
+        self.close()
+        camera = create_camera(driver.driver, driver.settings)
+        with ExitStack() as undo:
+            undo.callback(camera.close)
+            camera.open()
+            undo.pop_all()
+        self._kept = driver, camera
+        return camera
+
+    def close(self) -> None:
+        """Close the camera that is open; the next scan opens it anew."""
+        if self._kept is not None:
+            self._kept[1].close()
+        self._kept = None
+
+
+def cell_of(plan: Plan, camera: Camera, arm: Arm) -> Cell:
+    """Return the cell of a plan and its open devices."""
+    flange_T_camera = validated_transform(plan.flange_T_camera, "cell.flange_T_camera")
+    return Cell(camera, arm, flange_T_camera, plan.reference, plan.candidates)
+
+
+def _cell_plan(job: CellJob) -> Plan:
+    views = dome_views(job.cell.target_m, job.cell.dome)
+    part = _part_of(job.cell, job.part)
+    return Plan(job.cell.camera, part, job.cell.flange_T_camera, views[0], views)
+
+
+def _part_of(cell: CellSettings, name: str) -> Part:
+    if cell.parts_dir is None:
+        return simulated_part(name)
+    files = [cell.parts_dir / f"{name}{suffix}" for suffix in CAD_SUFFIXES]
+    found = next((file for file in files if file.is_file()), None)
+    if found is None:
+        known = sorted({file.stem for file in _cad_files(cell.parts_dir)})
+        raise UnknownNameError(f"part: {name!r} is unknown, known are {', '.join(known) or 'none'}")
+    return load_part(found)
+
+
+def _cad_files(folder: Path) -> list[Path]:
+    return [file for file in folder.iterdir() if file.suffix in CAD_SUFFIXES] if folder.is_dir() else []
+
+
+def _recording_plan(job: RecordingJob) -> Plan:
+    dataset = Dataset(job.root)
+    scene = dataset.scene(job.object, job.scene)
+    camera = DriverSettings(driver="replay", settings=job.driver_settings())
+    views = scene.views()
+    reference = views[0] if job.reference is None else scene.view(job.reference)
+    return Plan(camera, dataset.part(job.object), tuple(np.eye(4).ravel()), reference, views)

@@ -1,0 +1,86 @@
+"""What the command line shows of a scan: progress while it runs, then a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from sidelong_service.models import EventKind, ViewReport
+
+STAGES = ("move", "capture", "detect", "score", "fuse")
+
+
+class ScanProgress:
+    """Shows the events of a scan as they come. A context manager."""
+
+    def __init__(self, console: Console) -> None:
+        self.views: list[ViewReport] = []
+        self._console = console
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=30),
+            TextColumn("{task.fields[state]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+        )
+        self._phase: TaskID = self._progress.add_task("starting", total=None, state="")
+        self._work: TaskID | None = None
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def show(self, kind: EventKind, data: Mapping[str, Any]) -> None:
+        """Show an event."""
+        match kind:
+            case "phase":
+                self._progress.update(self._phase, description=data["phase"])
+            case "progress":
+                self._show_work(data["work"], data["done"], data["total"])
+            case "view":
+                self._show_view(ViewReport.model_validate(data))
+            case _:
+                pass
+
+    def _show_work(self, work: str, done: int, total: int) -> None:
+        if self._work is None:
+            self._work = self._progress.add_task(work, total=total, state="")
+        self._progress.update(self._work, completed=done, state=f"{done} of {total}")
+        if done >= total:
+            self._progress.remove_task(self._work)
+            self._work = None
+
+    def _show_view(self, view: ViewReport) -> None:
+        self.views.append(view)
+        self._progress.update(self._phase, state=f"{view.completeness:.0%} complete")
+        if view.index == 0:
+            text = f"{view.objects} objects, {view.missing_px} px without depth on them"
+        else:
+            text = f"gain {view.measured_gain_px:.0f} px, {view.completeness:.1%} complete"
+        self._console.print(f"  view {view.index}  {view.view}: {text}", highlight=False)
+
+
+def view_table(views: Sequence[ViewReport]) -> Table:
+    """Return the table of a scan: view, gains, completeness, seconds of each stage."""
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("\nview")
+    for name in ("expected\ngain px", "measured\ngain px", "\ncomplete", *(f"{stage}\ns" for stage in STAGES)):
+        table.add_column(name, justify="right")
+    for view in views:
+        gains = ("", "") if view.index == 0 else (f"{view.predicted_gain_px:.0f}", f"{view.measured_gain_px:.0f}")
+        seconds = [f"{view.stage_s[stage]:.2f}" if stage in view.stage_s else "" for stage in STAGES]
+        table.add_row(f"{view.index} {view.view}", *gains, f"{view.completeness:.1%}", *seconds)
+    return table

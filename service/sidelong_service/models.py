@@ -1,0 +1,221 @@
+"""What the HTTP interface takes and gives."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from sidelong.recipe import Recipe
+from sidelong.types import Step, Stop
+from sidelong_service.problems import Problem
+from sidelong_service.settings import Name
+
+
+class ScanState(StrEnum):
+    """Where a scan stands. ``interrupted``: a process died under it."""
+
+    ACCEPTED = "accepted"
+    RUNNING = "running"
+    STOPPING = "stopping"
+    SUCCEEDED = "succeeded"
+    STOPPED = "stopped"
+    FAILED = "failed"
+    INTERRUPTED = "interrupted"
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more happens to the scan."""
+        return self not in (ScanState.ACCEPTED, ScanState.RUNNING, ScanState.STOPPING)
+
+
+class CellState(StrEnum):
+    """Where the cell stands."""
+
+    STARTING = "starting"
+    IDLE = "idle"
+    EXECUTING = "executing"
+    STOPPING = "stopping"
+    FAULT = "fault"
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class RecordedScene(_Request):
+    """Recorded views in the place of camera and arm."""
+
+    dataset: Name = Field(description="id of a configured data set")
+    object: Name
+    scene: int = Field(ge=0, le=1_000_000)
+    reference: Name | None = Field(default=None, description="view whose depth is completed; none: the first")
+
+
+class ScanRequest(_Request):
+    """Complete the depth of the reference view: of the configured cell, or of a recorded scene."""
+
+    part: Name | None = Field(default=None, description="what lies in the configured cell")
+    recording: RecordedScene | None = None
+    recipe: Recipe = Recipe()
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.part is None) == (self.recording is None):
+            raise ValueError("give either part, for the configured cell, or recording")
+        return self
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class Candidate(_Answer):
+    """What the planner expects of a view, and why it could not be taken, if it could not."""
+
+    view: str
+    gain_px: float
+    lost_px: dict[str, float]
+    dropped: str | None
+
+
+class ViewReport(_Answer):
+    """One view of a scan: the gain expected and measured, the state after it, and what it cost."""
+
+    index: int
+    view: str
+    objects: int
+    predicted_gain_px: float
+    measured_gain_px: float
+    missing_px: int
+    recovered_px: int
+    completeness: float
+    stage_s: dict[str, float]
+    candidates: tuple[Candidate, ...]
+
+    @classmethod
+    def of(cls, step: Step) -> ViewReport:
+        """Return the report of a step."""
+        return cls(
+            index=step.index,
+            view=step.view.name,
+            objects=len(step.objects),
+            predicted_gain_px=step.predicted_gain_px,
+            measured_gain_px=step.measured_gain_px,
+            missing_px=step.missing_px,
+            recovered_px=step.recovered_px,
+            completeness=step.completeness,
+            stage_s=dict(step.stage_s),
+            candidates=tuple(
+                Candidate(view=s.view.name, gain_px=s.gain_px, lost_px=dict(s.lost_px), dropped=s.dropped)
+                for s in step.scores
+            ),
+        )
+
+
+class Setup(_Answer):
+    """What a scan runs with."""
+
+    part: str
+    camera: str
+    arm: str
+    width_px: int
+    height_px: int
+    candidates: int
+    left_out: tuple[str, ...]
+
+
+class Artifact(_Answer):
+    """A file a scan has made."""
+
+    name: str
+    media_type: str
+    size_bytes: int
+    sha256: str
+
+
+class ScanSummary(_Answer):
+    """A scan in the list."""
+
+    id: str
+    state: ScanState
+    phase: str | None
+    finish_reason: Stop | None
+    part: str | None
+    recording: RecordedScene | None
+    created_at: datetime
+    started_at: datetime | None
+    ended_at: datetime | None
+
+
+class Scan(ScanSummary):
+    """A scan with all it knows.
+
+    ``views`` are in the order taken, the reference view first; ``problem`` says why a scan failed.
+    """
+
+    problem: Problem | None
+    recipe: dict[str, Any]
+    setup: Setup | None
+    views: tuple[ViewReport, ...]
+    artifacts: tuple[Artifact, ...]
+
+
+class ScanList(_Answer):
+    """Scans, newest first; ``next_cursor`` asks for older ones."""
+
+    scans: tuple[ScanSummary, ...]
+    next_cursor: int | None
+
+
+class ArtifactList(_Answer):
+    """The files of a scan."""
+
+    artifacts: tuple[Artifact, ...]
+
+
+class CellReport(_Answer):
+    """The cell, and whether a scan may start now."""
+
+    name: str
+    mode: Literal["simulated", "real"]
+    state: CellState
+    camera: str
+    arm: str
+    active_scan: str | None
+    may_start: bool
+    reasons: tuple[str, ...]
+
+
+class StopReport(_Answer):
+    """The arm confirmed the stop; ``scan`` is the one that ends by it."""
+
+    stopped: Literal[True] = True
+    scan: str | None
+
+
+class Readiness(_Answer):
+    """What the service needs for a scan; each is ``ready`` or says what is wrong."""
+
+    ready: bool
+    arm: str
+    worker: str
+    storage: str
+
+
+EventKind = Literal["state", "phase", "progress", "setup", "view", "artifact"]
+
+
+class ScanEvent(_Answer):
+    """One line in the life of a scan, numbered over all scans."""
+
+    id: int
+    scan: str
+    kind: EventKind
+    at: datetime
+    data: dict[str, Any]
+
+
+Limit = Annotated[int, Field(ge=1, le=200)]

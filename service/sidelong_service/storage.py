@@ -1,0 +1,208 @@
+"""What outlives the service: scans, their events and the names of their files, in one SQLite database.
+
+One connection, owned by one thread. Events are the truth about a scan's course; the row of a scan holds its present
+state. The files themselves lie in ``<data_dir>/scans/<id>/``.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sidelong.types import Stop
+from sidelong_service.models import (
+    Artifact,
+    EventKind,
+    Scan,
+    ScanEvent,
+    ScanList,
+    ScanRequest,
+    ScanState,
+    ScanSummary,
+    Setup,
+    ViewReport,
+)
+from sidelong_service.problems import Problem, problem
+
+MIGRATIONS = (
+    """
+    CREATE TABLE scans (
+        seq INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE, state TEXT NOT NULL, phase TEXT,
+        finish_reason TEXT, problem TEXT, request TEXT NOT NULL,
+        created_at TEXT NOT NULL, started_at TEXT, ended_at TEXT
+    ) STRICT;
+    CREATE TABLE events (
+        id INTEGER PRIMARY KEY AUTOINCREMENT, scan TEXT NOT NULL REFERENCES scans(id), kind TEXT NOT NULL,
+        at TEXT NOT NULL, data TEXT NOT NULL
+    ) STRICT;
+    CREATE INDEX events_of_scan ON events(scan, id);
+    CREATE TABLE artifacts (
+        scan TEXT NOT NULL REFERENCES scans(id), name TEXT NOT NULL, media_type TEXT NOT NULL,
+        size_bytes INTEGER NOT NULL, sha256 TEXT NOT NULL, PRIMARY KEY (scan, name)
+    ) STRICT;
+    """,
+)
+"""Applied in order; ``user_version`` counts those a database has had."""
+
+_OPEN_STATES = tuple(state.value for state in ScanState if not state.ended)
+
+
+def utc_now() -> datetime:
+    """Return the present time."""
+    return datetime.now(UTC)
+
+
+class Storage:
+    """The database. All calls must come from the thread that made it."""
+
+    def __init__(self, file: Path, now: Callable[[], datetime] = utc_now) -> None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        self._now = now
+        self._db = sqlite3.connect(file, isolation_level=None)
+        self._db.row_factory = sqlite3.Row
+        self._db.execute("PRAGMA journal_mode = WAL")
+        self._db.execute("PRAGMA synchronous = FULL")
+        self._db.execute("PRAGMA foreign_keys = ON")
+        self._migrate()
+
+    def close(self) -> None:
+        """Close the database."""
+        self._db.close()
+
+    def create(self, scan_id: str, request: ScanRequest) -> None:
+        """Add an accepted scan."""
+        with self._transaction():
+            self._db.execute(
+                "INSERT INTO scans (id, state, request, created_at) VALUES (?, ?, ?, ?)",
+                (scan_id, ScanState.ACCEPTED, request.model_dump_json(), self._stamp()),
+            )
+            self._add_event(scan_id, "state", {"state": ScanState.ACCEPTED})
+
+    def set_state(
+        self, scan_id: str, state: ScanState, finish_reason: Stop | None = None, trouble: Problem | None = None
+    ) -> None:
+        """Change the state of a scan; an ended scan stays as it is."""
+        with self._transaction():
+            row = self._row(scan_id)
+            if row is None or ScanState(row["state"]).ended:
+                return
+            document = None if trouble is None else trouble.model_dump_json(exclude_none=True)
+            self._db.execute(
+                "UPDATE scans SET state = ?, finish_reason = ?, problem = ?, started_at = ?, ended_at = ?, phase = ? "
+                "WHERE id = ?",
+                (
+                    state,
+                    finish_reason,
+                    document,
+                    row["started_at"] or (self._stamp() if state is ScanState.RUNNING else None),
+                    self._stamp() if state.ended else None,
+                    None if state.ended else row["phase"],
+                    scan_id,
+                ),
+            )
+            data = {"state": state, "finish_reason": finish_reason, "problem": document and json.loads(document)}
+            self._add_event(scan_id, "state", data)
+
+    def add_event(self, scan_id: str, kind: EventKind, data: Mapping[str, Any]) -> None:
+        """Add an event; a phase and an artifact enter their tables too."""
+        with self._transaction():
+            if kind == "phase":
+                self._db.execute("UPDATE scans SET phase = ? WHERE id = ?", (data["phase"], scan_id))
+            if kind == "artifact":
+                self._db.execute(
+                    "INSERT OR REPLACE INTO artifacts (scan, name, media_type, size_bytes, sha256) "
+                    "VALUES (:scan, :name, :media_type, :size_bytes, :sha256)",
+                    {"scan": scan_id, **data},
+                )
+            self._add_event(scan_id, kind, data)
+
+    def interrupt_open_scans(self) -> int:
+        """Mark scans that a former service left open as interrupted, and return how many there were."""
+        query = f"SELECT id FROM scans WHERE state IN ({','.join('?' * len(_OPEN_STATES))})"
+        left = [str(row["id"]) for row in self._db.execute(query, _OPEN_STATES)]
+        for scan_id in left:
+            trouble = problem("service-restarted", "The service ended while this scan was active.", scan_id=scan_id)
+            self.set_state(scan_id, ScanState.INTERRUPTED, trouble=trouble)
+        return len(left)
+
+    def scan(self, scan_id: str) -> Scan | None:
+        """Return a scan with all it knows, None where there is none."""
+        row = self._row(scan_id)
+        if row is None:
+            return None
+        request = ScanRequest.model_validate_json(row["request"])
+        setups = [Setup.model_validate(event.data) for event in self.events(scan_id, kind="setup")]
+        return Scan(
+            **dict(_summary(row, request)),
+            problem=Problem.model_validate_json(row["problem"]) if row["problem"] else None,
+            recipe=request.recipe.model_dump(mode="json"),
+            setup=setups[-1] if setups else None,
+            views=tuple(ViewReport.model_validate(event.data) for event in self.events(scan_id, kind="view")),
+            artifacts=self.artifacts(scan_id),
+        )
+
+    def has_ended(self, scan_id: str) -> bool:
+        """Say whether nothing more happens to a scan; true where there is none."""
+        row = self._row(scan_id)
+        return row is None or ScanState(row["state"]).ended
+
+    def scans(self, limit: int, before: int | None = None) -> ScanList:
+        """Return the newest scans, or those before a cursor."""
+        query = "SELECT * FROM scans WHERE seq < ? ORDER BY seq DESC LIMIT ?"
+        rows = self._db.execute(query, (before if before is not None else 2**63 - 1, limit + 1)).fetchall()
+        summaries = [_summary(row, ScanRequest.model_validate_json(row["request"])) for row in rows[:limit]]
+        return ScanList(scans=tuple(summaries), next_cursor=rows[limit - 1]["seq"] if len(rows) > limit else None)
+
+    def events(self, scan_id: str, after: int = 0, kind: EventKind | None = None) -> list[ScanEvent]:
+        """Return the events of a scan after the given one, oldest first."""
+        query = "SELECT * FROM events WHERE scan = ? AND id > ? AND kind = coalesce(?, kind) ORDER BY id"
+        return [_event(row) for row in self._db.execute(query, (scan_id, after, kind))]
+
+    def artifacts(self, scan_id: str) -> tuple[Artifact, ...]:
+        """Return the files of a scan, in the order they were made."""
+        rows = self._db.execute("SELECT * FROM artifacts WHERE scan = ? ORDER BY rowid", (scan_id,))
+        return tuple(Artifact.model_validate({key: row[key] for key in Artifact.model_fields}) for row in rows)
+
+    def _row(self, scan_id: str) -> sqlite3.Row | None:
+        return self._db.execute("SELECT * FROM scans WHERE id = ?", (scan_id,)).fetchone()
+
+    def _add_event(self, scan_id: str, kind: EventKind, data: Mapping[str, Any]) -> None:
+        given = json.dumps({key: value for key, value in data.items() if value is not None}, allow_nan=False)
+        self._db.execute(
+            "INSERT INTO events (scan, kind, at, data) VALUES (?, ?, ?, ?)", (scan_id, kind, self._stamp(), given)
+        )
+
+    def _stamp(self) -> str:
+        return self._now().isoformat(timespec="milliseconds")
+
+    @contextmanager
+    def _transaction(self) -> Generator[None]:
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            self._db.execute("ROLLBACK")
+            raise
+        self._db.execute("COMMIT")
+
+    def _migrate(self) -> None:
+        version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
+        for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
+            self._db.executescript(f"BEGIN IMMEDIATE; {script} PRAGMA user_version = {number}; COMMIT;")
+
+
+def _summary(row: sqlite3.Row, request: ScanRequest) -> ScanSummary:
+    columns = ("id", "state", "phase", "finish_reason", "created_at", "started_at", "ended_at")
+    values = {name: row[name] for name in columns}
+    return ScanSummary.model_validate({**values, "part": request.part, "recording": request.recording})
+
+
+def _event(row: sqlite3.Row) -> ScanEvent:
+    return ScanEvent.model_validate(
+        {**{key: row[key] for key in ("id", "scan", "kind", "at")}, "data": json.loads(row["data"])}
+    )

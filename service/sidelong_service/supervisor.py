@@ -1,0 +1,377 @@
+"""The cell: its processes, the one scan that may be active, and the stop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+from sidelong.types import Stop
+from sidelong_service.children import ArmLink, ChildGoneError, WorkerLink
+from sidelong_service.events import Bulletin
+from sidelong_service.messages import CellJob, CheckJob, Job, Note, RecordingJob, RunJob
+from sidelong_service.models import CellReport, CellState, Readiness, ScanRequest, ScanState
+from sidelong_service.problems import Problem, ServiceError, problem, problem_of
+from sidelong_service.settings import ServiceSettings
+from sidelong_service.storage import Storage
+from sidelong_service.storage_thread import StorageThread
+
+log = logging.getLogger(__name__)
+
+RESTART_S = 0.5
+"""Between the end of a process and the start of the next one in its place."""
+STOPPING_S = 15.0
+"""What a scan gets to end after a stop, before its worker is killed."""
+CLOSING_S = 0.7
+"""The same, where the service ends."""
+
+
+@dataclass(eq=False)
+class ActiveScan:
+    """The scan that has the cell."""
+
+    id: str
+    request: ScanRequest
+    job: Job
+    stop_asked: bool = False
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a scan ended."""
+
+    state: ScanState
+    finish_reason: Stop | None = None
+    problem: Problem | None = None
+
+
+class Supervisor:
+    """Owns arm host and scan worker, starts them again when they die, and runs one scan at a time.
+
+    Parameters
+    ----------
+    settings
+        Of the service.
+    storage
+        Where scans are kept.
+    new_id
+        Makes ids of scans.
+    """
+
+    def __init__(self, settings: ServiceSettings, storage: StorageThread, new_id: Callable[[], str]) -> None:
+        self._settings = settings
+        self._storage = storage
+        self._new_id = new_id
+        self._sockets = Path()
+        self._socket_numbers = count()
+        self._arm: ArmLink | None = None
+        self._guest_arm: ArmLink | None = None
+        self._arm_name = settings.cell.arm.driver
+        self._arm_trouble = "is starting"
+        self._worker: WorkerLink | None = None
+        self._worker_trouble = "is starting"
+        self._active: ActiveScan | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._keepers: list[asyncio.Task[None]] = []
+        self._closing = False
+        self.bulletin = Bulletin()
+
+    async def start(self) -> None:
+        """Start the processes; scans that a former service left open are marked as interrupted."""
+        left = await self._storage.call(Storage.interrupt_open_scans)
+        if left:
+            log.warning("%d scans were interrupted when the service last ended", left)
+        self._sockets = Path(tempfile.mkdtemp(prefix="sidelong-"))
+        self._keepers = [asyncio.create_task(self._keep_arm()), asyncio.create_task(self._keep_worker())]
+
+    def begin_closing(self) -> None:
+        """Stop the arm and the active scan, take no other, and end the event streams. Harmless when repeated."""
+        if not self._closing:
+            self._closing = True
+            self._spawn(self._stop_quietly())
+            self.bulletin.close()
+
+    async def close(self) -> None:
+        """Stop the arm, then end the active scan and the processes."""
+        self.begin_closing()
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=CLOSING_S)
+        if self._worker is not None:
+            self._worker.kill()
+        for keeper in self._keepers:
+            keeper.cancel()
+        await asyncio.gather(*self._keepers, *self._tasks, return_exceptions=True)
+        shutil.rmtree(self._sockets, ignore_errors=True)
+
+    async def submit(self, request: ScanRequest) -> str:
+        """Accept a scan and return its id.
+
+        Raises
+        ------
+        ServiceError
+            Another scan is active, the cell is not ready, or the request names what is not there.
+        """
+        if self._active is not None:
+            raise ServiceError(
+                problem("cell-busy", f"Scan {self._active.id} is active.", scan_id=self._active.id)
+            )  # fmt: skip
+        job = self._job(request)
+        reasons = self._hindrances(job)
+        if reasons:
+            raise ServiceError(problem("not-ready", "; ".join(reasons) + ".", reasons=reasons))
+        scan = self._active = ActiveScan(self._new_id(), request, job)
+        try:
+            await self._check(scan)
+            await self._storage.call(Storage.create, scan.id, request)
+        except BaseException:
+            self._active = None
+            raise
+        self._spawn(self._conduct(scan))
+        return scan.id
+
+    async def stop(self) -> str | None:
+        """Stop the arm and the active scan, and return its id.
+
+        No lock, queue or database stands before the message to the arm.
+
+        Raises
+        ------
+        ServiceError
+            The arm did not confirm in time.
+        """
+        scan = self._active
+        stops = [link.stop() for link in (self._arm, self._guest_arm) if link is not None]
+        if scan is not None:
+            self._end_early(scan)
+        confirmed = await asyncio.gather(*stops)
+        if self._arm is None or not all(confirmed):
+            scan_id = scan.id if scan is not None else None
+            raise ServiceError(
+                problem("stop-unconfirmed", f"Arm {self._arm_name} did not confirm that it stops.", scan_id=scan_id)
+            )
+        return scan.id if scan is not None else None
+
+    def cell(self) -> CellReport:
+        """Report on the cell."""
+        cell = self._settings.cell
+        reasons = self._hindrances(None)
+        if self._active is not None:
+            reasons = (f"scan {self._active.id} is active", *reasons)
+        return CellReport(
+            name=cell.name,
+            mode="simulated" if cell.simulated else "real",
+            state=self._state(),
+            camera=cell.camera.driver,
+            arm=self._arm_name,
+            active_scan=self._active.id if self._active is not None else None,
+            may_start=not reasons,
+            reasons=reasons,
+        )
+
+    async def readiness(self) -> Readiness:
+        """Report what the service needs for a scan."""
+        try:
+            await self._storage.call(Storage.scans, 1)
+            storage = "ready"
+        except sqlite3.Error as error:
+            storage = f"cannot be read: {error}"
+        arm, worker = self._arm_trouble or "ready", self._worker_trouble or "ready"
+        return Readiness(ready=(arm, worker, storage) == ("ready",) * 3, arm=arm, worker=worker, storage=storage)
+
+    def _state(self) -> CellState:
+        if self._active is not None:
+            return CellState.STOPPING if self._active.stop_asked else CellState.EXECUTING
+        troubles = [trouble for trouble in (self._arm_trouble, self._worker_trouble) if trouble]
+        if not troubles:
+            return CellState.IDLE
+        return CellState.STARTING if set(troubles) == {"is starting"} else CellState.FAULT
+
+    def _hindrances(self, job: Job | None) -> tuple[str, ...]:
+        """Say what keeps a job from starting; recorded views need no arm of the cell."""
+        reasons = ["the service is ending"] if self._closing else []
+        if self._arm_trouble and not isinstance(job, RecordingJob):
+            reasons.append(f"arm {self._arm_name}: {self._arm_trouble}")
+        if self._worker_trouble:
+            reasons.append(f"scan worker: {self._worker_trouble}")
+        return tuple(reasons)
+
+    def _job(self, request: ScanRequest) -> Job:
+        recording = request.recording
+        if recording is None:
+            return CellJob(cell=self._settings.cell, part=request.part or "")
+        root = self._settings.datasets.get(recording.dataset)
+        if root is None:
+            known = ", ".join(sorted(self._settings.datasets)) or "none"
+            raise ServiceError(
+                problem("unknown-name", f"dataset: {recording.dataset!r} is unknown, known are {known}")
+            )  # fmt: skip
+        return RecordingJob(
+            root=root.resolve(), object=recording.object, scene=recording.scene, reference=recording.reference
+        )
+
+    async def _check(self, scan: ActiveScan) -> None:
+        worker = self._worker
+        try:
+            if worker is None:
+                raise ChildGoneError("the scan worker has gone")
+            trouble = await worker.check(CheckJob(job=scan.job, recipe=scan.request.recipe))
+        except ChildGoneError as error:
+            if worker is not None:
+                worker.kill()
+            raise ServiceError(
+                problem("worker-died", f"The scan worker could not check the request: {error}.")
+            ) from error
+        if trouble is not None:
+            raise ServiceError(trouble)
+
+    async def _conduct(self, scan: ActiveScan) -> None:
+        """See a scan through to its end, whatever happens."""
+        try:
+            ending = await self._run(scan)
+        except ServiceError as error:
+            ending = Ending(ScanState.FAILED, problem=error.problem)
+        except Exception as error:
+            log.exception("scan %s", scan.id)
+            ending = Ending(ScanState.FAILED, problem=problem_of(error))
+        try:
+            await self._set_state(scan.id, self._judge(scan, ending))
+        finally:
+            self._active = None
+            self.bulletin.post()
+
+    def _judge(self, scan: ActiveScan, ending: Ending) -> Ending:
+        """Say how a scan ended: one that was stopped did not fail, whatever error the stop brought about."""
+        if ending.state is ScanState.SUCCEEDED:
+            return ending
+        if self._closing:
+            trouble = problem("service-restarted", "The service ended during the scan.", scan_id=scan.id)
+            return Ending(ScanState.INTERRUPTED, problem=trouble)
+        return Ending(ScanState.STOPPED) if scan.stop_asked else ending
+
+    async def _run(self, scan: ActiveScan) -> Ending:
+        async with contextlib.AsyncExitStack() as stack:
+            arm, name = await self._arm_for(scan.job, stack)
+            worker = self._worker
+            if worker is None:
+                raise ServiceError(problem("worker-died", "The scan worker ended before the scan began."))
+            await self._set_state(scan.id, Ending(ScanState.RUNNING))
+            # from here to the job no await: a stop comes either before, and is seen, or after, and finds both at work
+            if scan.stop_asked:
+                return Ending(ScanState.STOPPED)
+            arm.release()
+            folder, cache = self._settings.data_dir / "scans" / scan.id, self._settings.data_dir / "templates"
+            worker.run(
+                RunJob(
+                    job=scan.job,
+                    recipe=scan.request.recipe,
+                    arm_socket=arm.path,
+                    arm_name=name,
+                    folder=folder.resolve(),
+                    cache_dir=cache.resolve(),
+                )
+            )
+            try:
+                return await self._follow(scan, worker)
+            except ChildGoneError:
+                await arm.stop()
+                trouble = problem("worker-died", "The scan worker ended during the scan.", scan_id=scan.id)
+                return Ending(ScanState.INTERRUPTED, problem=trouble)
+
+    async def _follow(self, scan: ActiveScan, worker: WorkerLink) -> Ending:
+        """Keep what the worker tells until it is done."""
+        while True:
+            message = await worker.next()
+            if isinstance(message, Note):
+                await self._storage.call(Storage.add_event, scan.id, message.event, message.data)
+                self.bulletin.post()
+            elif message.kind == "done":
+                if message.finish_reason is not None:
+                    return Ending(ScanState.SUCCEEDED, message.finish_reason)
+                state = ScanState.STOPPED if message.problem is None else ScanState.FAILED
+                return Ending(state, problem=message.problem)
+
+    async def _arm_for(self, job: Job, stack: contextlib.AsyncExitStack) -> tuple[ArmLink, str]:
+        """Return the arm of a job and its name: the cell's, or for recorded views one for this scan alone."""
+        if isinstance(job, CellJob):
+            if self._arm is None:
+                raise ServiceError(problem("device-lost", f"arm {self._arm_name}: {self._arm_trouble}"))
+            return self._arm, self._arm_name
+        guest = self._guest_arm = ArmLink(job.arm(), self._new_socket())
+        stack.push_async_callback(self._close_guest, guest)
+        return guest, await guest.open()
+
+    async def _close_guest(self, guest: ArmLink) -> None:
+        self._guest_arm = None
+        await guest.close()
+
+    def _end_early(self, scan: ActiveScan) -> None:
+        """Ask for the end of a scan, once; kill its worker where it does not come."""
+        if scan.stop_asked:
+            return
+        scan.stop_asked = True
+        if self._worker is not None:
+            self._worker.cancel()
+            asyncio.get_running_loop().call_later(STOPPING_S, self._kill_if_active, scan, self._worker)
+        self._spawn(self._set_state(scan.id, Ending(ScanState.STOPPING)))
+
+    def _kill_if_active(self, scan: ActiveScan, worker: WorkerLink) -> None:
+        if self._active is scan:
+            log.error("scan %s did not end within %g s of the stop: its worker is killed", scan.id, STOPPING_S)
+            worker.kill()
+
+    async def _stop_quietly(self) -> None:
+        try:
+            await self.stop()
+        except ServiceError as error:
+            log.error("while the service ends: %s", error)
+
+    async def _set_state(self, scan_id: str, ending: Ending) -> None:
+        await self._storage.call(Storage.set_state, scan_id, ending.state, ending.finish_reason, ending.problem)
+        self.bulletin.post()
+
+    async def _keep_arm(self) -> None:
+        """Keep the cell's arm host running."""
+        while True:
+            link = ArmLink(self._settings.cell.arm, self._new_socket())
+            try:
+                self._arm_name = await link.open()
+                self._arm, self._arm_trouble = link, ""
+                await link.gone()
+                self._arm_trouble = "its process ended"
+            except ServiceError as error:
+                self._arm_trouble = error.problem.detail
+            finally:
+                self._arm = None
+                await link.close()
+            await asyncio.sleep(RESTART_S)
+
+    async def _keep_worker(self) -> None:
+        """Keep the scan worker running."""
+        while True:
+            link = WorkerLink()
+            try:
+                await link.open()
+                self._worker, self._worker_trouble = link, ""
+                await link.gone()
+                self._worker_trouble = "its process ended"
+            except ChildGoneError as error:
+                self._worker_trouble = str(error)
+            finally:
+                self._worker = None
+                await link.close()
+            await asyncio.sleep(RESTART_S)
+
+    def _new_socket(self) -> Path:
+        return self._sockets / f"arm{next(self._socket_numbers)}"
+
+    def _spawn(self, work: Coroutine[object, object, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)

@@ -1,0 +1,191 @@
+"""A cell controller runs a scan over HTTP and reads everything back."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from service_process import QUICK_SCAN, ServiceProcess
+
+
+@pytest.fixture(scope="module")
+def ended(service: ServiceProcess) -> dict[str, Any]:
+    """A scan that has run to its end."""
+    return service.run_quick_scan()
+
+
+def read(service: ServiceProcess, scan: dict[str, Any], name: str) -> bytes:
+    return service.http.get(f"/v1/scans/{scan['id']}/artifacts/{name}").raise_for_status().content
+
+
+def test_scan_is_accepted_with_its_location_and_runs_by_itself(service: ServiceProcess) -> None:
+    answer = service.http.post("/v1/scans", json=QUICK_SCAN)
+    assert answer.status_code == 202
+    assert answer.headers["Location"] == f"/v1/scans/{answer.json()['id']}"
+    assert answer.json()["state"] == "accepted"
+    assert answer.json()["recipe"]["planning"]["max_views"] == 2
+    ended = service.ended(answer.json()["id"])
+    assert ended["state"] == "succeeded"
+    assert ended["created_at"] <= ended["started_at"] <= ended["ended_at"]
+
+
+def test_each_view_tells_its_gains_its_times_and_why_others_were_not_taken(ended: dict[str, Any]) -> None:
+    views = ended["views"]
+    assert ended["finish_reason"] == "max_views"
+    assert [view["index"] for view in views] == [0, 1, 2]
+    assert views[0]["missing_px"] > 100
+    for before, after in zip(views, views[1:], strict=False):
+        assert after["measured_gain_px"] == after["recovered_px"] - before["recovered_px"]
+        taken = max(before["candidates"], key=lambda candidate: candidate["gain_px"])
+        assert (after["view"], after["predicted_gain_px"]) == (taken["view"], taken["gain_px"])
+        dropped = {c["view"]: c["dropped"] for c in before["candidates"] if c["dropped"]}
+        assert dropped[before["view"]] == "already taken"
+        assert {"move", "capture", "fuse"} <= after["stage_s"].keys()
+    assert views[-1]["completeness"] == pytest.approx(views[-1]["recovered_px"] / views[-1]["missing_px"])
+    assert any("inter-reflection" in term for term in ended["setup"]["left_out"])
+
+
+def test_files_have_the_checksums_and_sizes_that_are_listed(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    listed = service.http.get(f"/v1/scans/{ended['id']}/artifacts").json()["artifacts"]
+    assert listed == ended["artifacts"]
+    names = {"depth.png", "depth.npz", "cloud.ply", "picture.png", "report.json"}
+    assert {artifact["name"] for artifact in listed} == names | {"view_00.npz", "view_01.npz", "view_02.npz"}
+    for artifact in listed:
+        answer = service.http.get(f"/v1/scans/{ended['id']}/artifacts/{artifact['name']}")
+        assert answer.headers["Content-Type"] == artifact["media_type"]
+        assert len(answer.content) == artifact["size_bytes"]
+        assert hashlib.sha256(answer.content).hexdigest() == artifact["sha256"]
+        assert answer.headers["ETag"] == f'"{artifact["sha256"]}"'
+
+
+def test_png_and_npz_hold_the_same_depth(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    arrays = np.load(io.BytesIO(read(service, ended, "depth.npz")))
+    report = json.loads(read(service, ended, "report.json"))
+    picture = cv2.imdecode(np.frombuffer(read(service, ended, "depth.png"), np.uint8), cv2.IMREAD_UNCHANGED)
+    depth_m = arrays["depth_m"]
+    assert picture.dtype == np.uint16
+    assert picture.shape == depth_m.shape == (256, 320)
+    assert np.array_equal(picture == 0, np.isnan(depth_m))
+    unit_m = report["depth_png"]["unit_m"]
+    np.testing.assert_allclose((picture * unit_m)[picture > 0], depth_m[picture > 0], atol=unit_m / 2 * 1.001)
+    assert np.array_equal(arrays["source"] < 0, np.isnan(depth_m))
+    assert set(np.unique(arrays["source"])) <= {-1, 0, 1, 2}
+
+
+def test_cloud_lies_where_depth_and_pose_say(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    arrays = np.load(io.BytesIO(read(service, ended, "depth.npz")))
+    header, _, body = read(service, ended, "cloud.ply").partition(b"end_header\n")
+    vertices = np.frombuffer(body, dtype=[("point", "<f4", 3), ("colour", "u1", 3)])
+    rows, columns = np.nonzero(np.isfinite(arrays["depth_m"]))
+    assert f"element vertex {len(rows)}\n".encode() in header
+    assert len(vertices) == len(rows)
+    # back through the inverse pose and the intrinsics, each point lands on its own pixel, at its own depth
+    base_T_camera, intrinsics = arrays["base_T_camera"], arrays["K"]
+    points_camera = (vertices["point"] - base_T_camera[:3, 3]) @ base_T_camera[:3, :3]
+    projected = points_camera @ intrinsics.T
+    np.testing.assert_allclose(points_camera[:, 2], arrays["depth_m"][rows, columns], atol=1e-6)
+    np.testing.assert_allclose(projected[:, 0] / projected[:, 2], columns, atol=1e-3)
+    np.testing.assert_allclose(projected[:, 1] / projected[:, 2], rows, atol=1e-3)
+
+
+def test_what_the_reference_view_measured_is_in_the_result_to_the_bit(
+    service: ServiceProcess, ended: dict[str, Any]
+) -> None:
+    first = np.load(io.BytesIO(read(service, ended, "view_00.npz")))["depth_m"]
+    result = np.load(io.BytesIO(read(service, ended, "depth.npz")))
+    measured = np.isfinite(first)
+    assert np.array_equal(result["source"] == 0, measured)
+    assert np.array_equal(result["depth_m"][measured].astype(np.float32), first[measured])
+
+
+def test_report_says_what_the_scan_says(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    report = json.loads(read(service, ended, "report.json"))
+    assert report["views"] == ended["views"]
+    assert report["recipe"] == ended["recipe"]
+    assert report["finish_reason"] == ended["finish_reason"]
+    assert report["depth_png"]["beyond_largest_px"] == 0
+
+
+def test_picture_is_a_picture(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    picture = cv2.imdecode(np.frombuffer(read(service, ended, "picture.png"), np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] == 1300
+    assert picture.std() > 20
+
+
+def test_same_request_gives_the_same_depth(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    again = service.run_quick_scan()
+    assert again["id"] != ended["id"]
+    first, second = (np.load(io.BytesIO(read(service, scan, "depth.npz"))) for scan in (ended, again))
+    assert np.array_equal(first["depth_m"], second["depth_m"], equal_nan=True)
+    assert [view["view"] for view in again["views"]] == [view["view"] for view in ended["views"]]
+
+
+def test_a_second_scan_is_refused_while_one_is_active_and_is_told_which(service: ServiceProcess) -> None:
+    active = service.http.post("/v1/scans", json=QUICK_SCAN).json()
+    cell = service.http.get("/v1/cell").json()
+    refused = service.http.post("/v1/scans", json=QUICK_SCAN)
+    assert refused.status_code == 409
+    assert refused.headers["Content-Type"] == "application/problem+json"
+    problem = refused.json()
+    assert problem["type"] == "urn:sidelong:problem:cell-busy"
+    assert (problem["code"], problem["retryable"], problem["scan_id"]) == (2001, True, active["id"])
+    assert (cell["state"], cell["active_scan"], cell["may_start"]) == ("executing", active["id"], False)
+    assert service.ended(active["id"])["state"] == "succeeded"
+    assert service.http.get("/v1/cell").json()["may_start"] is True
+
+
+def test_events_tell_the_whole_course_and_can_be_replayed(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    events = list(service.client.events(ended["id"]))
+    ids = [event.id for event in events]
+    assert ids == sorted(set(ids))
+    states = [event.data["state"] for event in events if event.kind == "state"]
+    assert states == ["accepted", "running", "succeeded"]
+    assert [event.data for event in events if event.kind == "view"] == ended["views"]
+    phases = [event.data["phase"] for event in events if event.kind == "phase"]
+    assert phases[:4] == ["move", "capture", "capture", "detect"]
+    for cut in (0, len(events) // 2, len(events) - 1):
+        assert list(service.client.events(ended["id"], after=ids[cut])) == events[cut + 1 :]
+
+
+def test_a_reader_that_comes_back_misses_nothing_of_a_running_scan(service: ServiceProcess) -> None:
+    scan_id = service.http.post("/v1/scans", json=QUICK_SCAN).json()["id"]
+    seen = []
+    stream = service.client.events(scan_id)
+    for event in stream:
+        seen.append(event)
+        if event.kind == "phase":
+            break
+    stream.close()
+    seen += service.client.events(scan_id, after=seen[-1].id)
+    assert seen == list(service.client.events(scan_id))
+    assert seen[-1].data["state"] == "succeeded"
+
+
+def test_scans_are_listed_newest_first_and_page_by_page(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    everything = [scan.id for scan in service.client.scans(limit=200).scans]
+    assert ended["id"] in everything
+    paged: list[str] = []
+    cursor = None
+    while True:
+        page = service.client.scans(limit=2, cursor=cursor)
+        paged += [scan.id for scan in page.scans]
+        cursor = page.next_cursor
+        if cursor is None:
+            break
+    assert paged == everything
+    times = [scan.created_at for scan in service.client.scans().scans]
+    assert times == sorted(times, reverse=True)
+
+
+def test_cell_and_health_are_told(service: ServiceProcess) -> None:
+    assert service.http.get("/livez").status_code == 200
+    ready = service.http.get("/readyz")
+    assert (ready.status_code, ready.json()["ready"]) == (200, True)
+    cell = service.http.get("/v1/cell").json()
+    assert (cell["mode"], cell["state"], cell["camera"]) == ("simulated", "idle", "simulated")
+    assert service.http.post("/v1/cell/stop").json() == {"stopped": True, "scan": None}
