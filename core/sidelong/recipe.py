@@ -144,9 +144,17 @@ def build_stages(
     SettingsError
         A material of the part has no reflectance, or a setting does not fit the part.
     """
+    detector = GivenObjects(objects) if objects is not None else _trained(recipe, part, rig, cache_dir, progress)
+    strategy = strategy_of(recipe.planning.strategy, recipe.planning.seed)
+    left_out = _left_out(recipe, given=objects is not None)
+    return Stages(part, rig, detector, strategy, light_model(recipe, part), left_out)
+
+
+def light_model(recipe: Recipe, part: Part) -> LightModel:
+    """Return what turns geometry into the probability of depth. Raises SettingsError as ``build_stages``."""
     from sidelong.planning.gain import LightModel
 
-    light = LightModel(
+    return LightModel(
         reflectances=recipe.light.reflectances(part.materials),
         intensity=recipe.light.intensity or DEFAULT_INTENSITY,
         fall_off=recipe.light.fall_off,
@@ -155,9 +163,6 @@ def build_stages(
         response=recipe.light.response(),
         sensing=recipe.sensing,
     )
-    detector = GivenObjects(objects) if objects is not None else _trained(recipe, part, rig, cache_dir, progress)
-    strategy = strategy_of(recipe.planning.strategy, recipe.planning.seed)
-    return Stages(part, rig, detector, strategy, light, _left_out(recipe, given=objects is not None))
 
 
 def _trained(

@@ -7,17 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from sidelong.evaluation.dataset import Dataset
-from sidelong_drivers.registry import create_camera
 
+from sidelong.calibration.light_fit import fit_intensity
 from sidelong.devices import Arm, Camera, Cell
 from sidelong.errors import UnknownNameError
+from sidelong.evaluation.dataset import Dataset
 from sidelong.geometry.mesh import Part, load_part
 from sidelong.geometry.transforms import validated_transform
 from sidelong.planning.candidates import dome_views
-from sidelong.recipe import Recipe
+from sidelong.recipe import Recipe, light_model
 from sidelong.simulation.parts import simulated_part
 from sidelong.types import View
+from sidelong_drivers.registry import create_camera
 from sidelong_service.messages import CellJob, Job, RecordingJob
 from sidelong_service.settings import CellSettings, DriverSettings
 
@@ -46,6 +47,25 @@ def plan_of(job: Job, recipe: Recipe) -> Plan:
     plan = _cell_plan(job) if isinstance(job, CellJob) else _recording_plan(job)
     recipe.light.reflectances(plan.part.materials)
     return plan
+
+
+def effective_recipe(job: Job, recipe: Recipe, part: Part) -> Recipe:
+    """Fit what a recipe leaves open: the projector's intensity, where recorded data have a white capture.
+
+    Raises
+    ------
+    InputError
+        The capture cannot be used.
+    """
+    if isinstance(job, CellJob) or recipe.light.intensity is not None:
+        return recipe
+    dataset = Dataset(job.root)
+    white = dataset.white_capture(job.object)
+    if white is None:
+        return recipe
+    fit = fit_intensity(white.frame, white.base_T_objects, part, dataset.rig, light_model(recipe, part))
+    light = recipe.light.model_copy(update={"intensity": fit.intensity})
+    return recipe.model_copy(update={"light": light})
 
 
 class Cameras:

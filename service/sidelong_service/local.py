@@ -7,11 +7,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from sidelong_drivers.registry import create_arm, create_camera
-
 from sidelong.errors import UnknownNameError
 from sidelong.types import Stop
-from sidelong_service.cells import cell_of, plan_of
+from sidelong_drivers.registry import create_arm, create_camera
+from sidelong_service.cells import cell_of, effective_recipe, plan_of
 from sidelong_service.messages import CellJob, Job, RecordingJob
 from sidelong_service.models import EventKind, ScanRequest
 from sidelong_service.runner import ScanRun
@@ -63,7 +62,8 @@ class LocalScan:
             arm.open()
             cache_dir = self._settings.data_dir / "templates"
             cell = cell_of(plan, camera, arm)
-            return ScanRun(cell, plan.part, self._request.recipe, self._folder, cache_dir, self).run()
+            recipe = effective_recipe(job, self._request.recipe, plan.part)
+            return ScanRun(cell, plan.part, recipe, self._folder, cache_dir, self).run()
 
     def note(self, kind: EventKind, data: Mapping[str, Any]) -> None:
         """Pass an event on."""

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from sidelong.errors import DeviceError, SidelongError
-from sidelong_service.cells import Cameras, cell_of, plan_of
+from sidelong_service.cells import Cameras, cell_of, effective_recipe, plan_of
 from sidelong_service.lines import Lines
 from sidelong_service.messages import (
     TO_WORKER,
@@ -90,7 +90,8 @@ class Worker:
             camera = self._cameras.open(plan.camera)
             arm.open()
             cell = cell_of(plan, camera, arm)
-            reason = ScanRun(cell, plan.part, job.recipe, job.folder, job.cache_dir, self).run()
+            recipe = effective_recipe(job.job, job.recipe, plan.part)
+            reason = ScanRun(cell, plan.part, recipe, job.folder, job.cache_dir, self).run()
         except Cancelled:
             return JobDone()
         except Exception as error:  # noqa: BLE001 - told to the API, and logged where unexpected

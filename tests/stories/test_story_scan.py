@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import json
 from typing import Any
 
@@ -39,7 +40,7 @@ def test_each_view_tells_its_gains_its_times_and_why_others_were_not_taken(ended
     assert ended["finish_reason"] == "max_views"
     assert [view["index"] for view in views] == [0, 1, 2]
     assert views[0]["missing_px"] > 100
-    for before, after in zip(views, views[1:], strict=False):
+    for before, after in itertools.pairwise(views):
         assert after["measured_gain_px"] == after["recovered_px"] - before["recovered_px"]
         taken = max(before["candidates"], key=lambda candidate: candidate["gain_px"])
         assert (after["view"], after["predicted_gain_px"]) == (taken["view"], taken["gain_px"])

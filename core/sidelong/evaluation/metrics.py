@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from sidelong.errors import DepthError
+from sidelong.geometry.camera_model import PinholeCamera
+from sidelong.geometry.mesh import Part
+from sidelong.geometry.raycast import RayScene
 from sidelong.types import BoolArray, FloatArray
 
 RECOVERED_WITHIN_M = 2e-3
 """Largest depth error of a recovered pixel (paper, section V-B)."""
+
+ON_PART_WITHIN_M = 3e-3
+"""How far true depth and posed CAD model may differ for a pixel to show the part: else something stands before it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,3 +62,26 @@ class Truth:
     def completeness(self, depth_m: FloatArray) -> float:
         """Return recovered over missing pixels, 0..1 (depth completion percentage of the paper, as a share)."""
         return float(self.recovered(depth_m).sum() / self.missing.sum())
+
+
+def truth_of(
+    depth_m: FloatArray,
+    measured: BoolArray,
+    parts: Sequence[tuple[Part, FloatArray]],
+    seen_from: tuple[PinholeCamera, FloatArray],
+) -> Truth:
+    """Return the truth of a view, its part pixels found by rendering the parts at their true poses.
+
+    Parameters
+    ----------
+    depth_m
+        (H, W) true depth, NaN where unknown.
+    measured
+        (H, W) pixels that had depth in the view.
+    parts
+        Each part with its ``base_T_object``.
+    seen_from
+        Camera and ``base_T_camera`` (4, 4) of the view.
+    """
+    rendered_m = RayScene(parts).render(*seen_from).depth_m
+    return Truth(depth_m, np.abs(rendered_m - depth_m) <= ON_PART_WITHIN_M, measured)

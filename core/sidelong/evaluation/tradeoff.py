@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -64,11 +65,9 @@ def summarise(rows: Sequence[Row]) -> list[Point]:
 
 def draw(points: Sequence[Point], path: Path) -> None:
     """Draw completeness against views, seconds of computing and seconds of cell time; write a PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12, 3.8), dpi=110, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    figure: Any = Figure(figsize=(12, 3.8), dpi=110, layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     for strategy in dict.fromkeys(point.strategy for point in points):
         mine = [point for point in points if point.strategy is strategy]
@@ -84,4 +83,4 @@ def draw(points: Sequence[Point], path: Path) -> None:
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("completeness, %")
     axes[0].legend()
-    canvas.print_png(str(path))
+    figure.savefig(path, format="png")
