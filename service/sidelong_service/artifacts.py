@@ -163,8 +163,14 @@ def _npz(arrays: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def _write(path: Path, content: bytes) -> Artifact:
-    """Write a file under another name, then rename it: it is there whole, or not at all, even after a power cut."""
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file under another name, then rename it: it is there whole, or not at all, even after a power cut.
+
+    Raises
+    ------
+    OSError
+        It cannot be written; nothing is left of it.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.part")
     try:
@@ -181,6 +187,10 @@ def _write(path: Path, content: bytes) -> Artifact:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def _write(path: Path, content: bytes) -> Artifact:
+    write_whole(path, content)
     return Artifact(
         name=path.name,
         media_type=MEDIA_TYPES[path.suffix],

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import ValidationError
 from rich.console import Console
 
 from sidelong.errors import SidelongError
+from sidelong.planning.selection import StrategyName
 from sidelong.recipe import Recipe
 from sidelong_service.client import ClientError, SidelongClient
-from sidelong_service.console import ScanProgress, view_table
+from sidelong_service.console import CountedProgress, ScanProgress, comparison_table, view_table
 from sidelong_service.models import EventKind, RecordedScene, ScanRequest, ScanState
 from sidelong_service.problems import validation_problem
+
+if TYPE_CHECKING:  # open3d and what needs it wait for the commands that use them
+    from sidelong.evaluation.compare import Row, Run
+    from sidelong_service.comparison import Case, Comparison
 
 app = typer.Typer(
     help="Next-best-view depth completion for shiny parts.",
@@ -101,6 +107,94 @@ def demo(
             scan_on_service(client, ScanRequest(part=part), output)
 
 
+@app.command()
+def compare(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a data set in ROBI's layout.")],
+    object_name: Annotated[str | None, typer.Option("--object", help="Object; none: all.")] = None,
+    scene: Annotated[int | None, typer.Option(min=0, help="Scene; none: all.")] = None,
+    references: Annotated[str, typer.Option(help="'all', or positions or names of views: 0,5,10.")] = "all",
+    views: Annotated[int, typer.Option(min=1, max=100, help="Views added to each reference view.")] = 3,
+    strategies: Annotated[str, typer.Option(help="Of nbv, random, max_distance.")] = "nbv,random,max_distance",
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs of the random strategy.")] = 5,
+    true_poses: Annotated[bool, typer.Option("--true-poses", help="Leave out detection; take the true poses.")] = False,
+    recipe: RecipeFile = None,
+    config: ConfigFile = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="File for all rows.")] = None,
+    plot: Annotated[Path, typer.Option(help="File for the plot, PNG.")] = Path("sidelong-comparison.png"),
+) -> None:
+    """Compare strategies on recorded scenes: completeness after each view, and against seconds."""
+    from sidelong.evaluation.dataset import Dataset
+    from sidelong_service.comparison import Comparison, cases_of
+    from sidelong_service.settings import load_settings
+
+    with plain_errors():
+        names = None if references == "all" else [name for name in references.split(",") if name]
+        settings = _recipe(recipe)
+        planning = settings.planning.model_copy(update={"max_views": views})
+        recorded = Dataset(dataset)
+        comparison = Comparison(
+            dataset=recorded,
+            cases=cases_of(recorded, object_name, scene, names),
+            runs=_runs(strategies, seeds),
+            recipe=settings.model_copy(update={"planning": planning}),
+            cache_dir=load_settings(config).data_dir / "templates",
+            true_poses=true_poses,
+        )
+        _compare(comparison, json_file, plot)
+
+
+def _compare(comparison: Comparison, json_file: Path | None, plot: Path) -> None:
+    """Run a comparison and show it; Ctrl-C keeps what there is."""
+    from sidelong.evaluation.tradeoff import draw, summarise
+    from sidelong_service.artifacts import write_whole
+
+    rows: list[Row] = []
+    total = len(comparison.cases) * len(comparison.runs) * comparison.recipe.planning.max_views
+    interrupted = False
+    with CountedProgress(err) as progress:
+
+        def skip(case: Case, why: str) -> None:
+            nonlocal total
+            total -= len(comparison.runs) * comparison.recipe.planning.max_views
+            progress.note(f"left out: {case.object} scene {case.scene} {case.reference}: {why}")
+
+        def train(done: int, pictures: int) -> None:
+            progress.show("training templates", done, pictures)
+
+        try:
+            for row in comparison.rows(skip, train):
+                rows.append(row)
+                progress.show(f"{row.object} scene {row.scene}", len(rows), total)
+        except KeyboardInterrupt:
+            interrupted = True
+    if json_file is not None:
+        write_whole(json_file, json.dumps([row.model_dump(mode="json") for row in rows], indent=1).encode())
+    if not rows:
+        raise CommandError(f"{comparison.dataset.root}: no reference view could be compared")
+    points = summarise(rows)
+    out.print(comparison_table(points))
+    write_whole(plot, draw(points, f"{', '.join(dict.fromkeys(row.object for row in rows))}: {len(rows)} rows"))
+    for file in (plot, *([json_file] if json_file is not None else [])):
+        out.print(f"  {file}", highlight=False, soft_wrap=True)
+    if interrupted:
+        raise typer.Exit(130)
+
+
+def _runs(strategies: str, seeds: int) -> tuple[Run, ...]:
+    from sidelong.evaluation.compare import Run
+
+    known = [name.value for name in StrategyName]
+    wanted = [name for name in strategies.split(",") if name]
+    unknown = [name for name in wanted if name not in known]
+    if unknown or not wanted:
+        raise CommandError(f"--strategies: {', '.join(unknown) or 'none'} given, known are {', '.join(known)}")
+    return tuple(
+        Run(StrategyName(name), seed)
+        for name in dict.fromkeys(wanted)
+        for seed in range(seeds if name == StrategyName.RANDOM else 1)
+    )
+
+
 def scan_on_service(client: SidelongClient, request: ScanRequest, output: Path) -> None:
     """Run a scan over HTTP, show it, and fetch its files. Ctrl-C stops it.
 
@@ -161,12 +255,22 @@ def _request(
         raise CommandError("give either --part, for the configured cell, or --dataset with --object")
     if dataset is not None and object_name is None:
         raise CommandError("--dataset needs --object")
+    recipe = _recipe(file)
     try:
-        recipe = Recipe() if file is None else Recipe.model_validate_json(file.read_bytes())
         if dataset is None or object_name is None:
             return ScanRequest(part=part, recipe=recipe)
         recording = RecordedScene(dataset=dataset, object=object_name, scene=scene, reference=reference)
         return ScanRequest(recording=recording, recipe=recipe)
     except ValidationError as error:
-        source = f"{file}: " if file is not None else ""
-        raise CommandError(source + validation_problem([dict(each) for each in error.errors()]).detail) from error
+        raise CommandError(_first_fields(error)) from error
+
+
+def _recipe(file: Path | None) -> Recipe:
+    try:
+        return Recipe() if file is None else Recipe.model_validate_json(file.read_bytes())
+    except ValidationError as error:
+        raise CommandError(f"{file}: {_first_fields(error)}") from error
+
+
+def _first_fields(error: ValidationError) -> str:
+    return validation_problem([dict(each) for each in error.errors()]).detail

@@ -8,9 +8,10 @@ from typing import Any, Self
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from sidelong.evaluation.tradeoff import Point
 from sidelong_service.models import EventKind, ViewReport
 
 STAGES = ("move", "capture", "detect", "score", "fuse")
@@ -83,4 +84,51 @@ def view_table(views: Sequence[ViewReport]) -> Table:
         gains = ("", "") if view.index == 0 else (f"{view.predicted_gain_px:.0f}", f"{view.measured_gain_px:.0f}")
         seconds = [f"{view.stage_s[stage]:.2f}" if stage in view.stage_s else "" for stage in STAGES]
         table.add_row(f"{view.index} {view.view}", *gains, f"{view.completeness:.1%}", *seconds)
+    return table
+
+
+class CountedProgress:
+    """Shows how much of a counted work is done, and how much a preparation. A context manager."""
+
+    def __init__(self, console: Console) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn())
+        self._progress = Progress(*columns, console=console, transient=True)
+        self._tasks: dict[str, TaskID] = {}
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def show(self, work: str, done: int, total: int) -> None:
+        """Show how far a work is; one that is done disappears."""
+        if work not in self._tasks:
+            self._tasks[work] = self._progress.add_task(work, total=total)
+        self._progress.update(self._tasks[work], completed=done, total=total, visible=done < total)
+
+    def note(self, text: str) -> None:
+        """Print a line above the bars."""
+        self._progress.console.print(text, highlight=False, soft_wrap=True)
+
+
+def comparison_table(points: Sequence[Point]) -> Table:
+    """Return the table of a comparison: strategies, completeness after each view, seconds."""
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("strategy")
+    for name in ("views added", "complete, mean", "complete, lowest", "computing s", "cell s", "references"):
+        table.add_column(name, justify="right")
+    for point in points:
+        table.add_row(
+            point.strategy.value,
+            str(point.views_added),
+            f"{point.completeness:.1%}",
+            f"{point.worst:.1%}",
+            f"{point.compute_s:.2f}",
+            f"{point.cell_s:.1f}",
+            str(point.references),
+        )
     return table

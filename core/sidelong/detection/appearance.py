@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
@@ -61,11 +62,25 @@ class AppearanceModel:
         return Look(uv, covered, normals)
 
 
-def explained_variance(look: Look, image: GrayImage, blur_px: float = 1.3) -> FloatArray:
-    """Return the share (K,) 0..1 of the grey values' variance that normals and silhouette explain."""
+def smoothed(image: GrayImage, blur_px: float = 1.3) -> NDArray[np.float32]:
+    """Return the image (H, W) without the noise that no normal explains."""
     import cv2
 
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur_px)
+    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur_px), dtype=np.float32)
+
+
+def explained_variance(look: Look, smooth: NDArray[np.float32]) -> FloatArray:
+    """Return the share (K,) 0..1 of the grey values' variance that normals and silhouette explain.
+
+    Parameters
+    ----------
+    look
+        What the poses look like.
+    smooth
+        (H, W) from ``smoothed``.
+    """
+    import cv2
+
     remap: Any = cv2.remap  # its stub forbids the None that means: coordinates are in one array
     sampled = remap(smooth, look.uv.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(
         np.float64

@@ -93,14 +93,16 @@ class ContourModel:
         self._tangents = (end - start)[row]
         self._weight = (length / count)[row]
         self._normals = coarse.triangle_normals[faces[row]]
+        self._offsets = (self._normals * self._points[:, None]).sum(axis=-1)
         self._outward = self._normals.sum(axis=1)
 
     def select(self, camera_T_object: FloatArray, rng: np.random.Generator) -> ContourPoints:
         """Draw ``contour_points`` for each pose (K, 4, 4), in proportion to length times expected contrast."""
         eye = invert(camera_T_object)[:, :3, 3]
-        to_eye = eye[:, None] - self._points
-        to_eye /= np.linalg.norm(to_eye, axis=-1, keepdims=True)
-        level = brightness(np.einsum("kmi,mfi->kmf", to_eye, self._normals), self._settings)
+        # n . (eye - p) as one matrix product: most of the time of a detection is spent here
+        height = (eye @ self._normals.reshape(-1, 3).T).reshape(len(eye), -1, 2) - self._offsets
+        distance = np.linalg.norm(eye[:, None] - self._points, axis=-1)
+        level = brightness(height / distance[..., None], self._settings)
         contrast = np.abs(level[..., 0] - level[..., 1])
         share = np.cumsum(self._weight * np.where(contrast >= LEAST_STEP, contrast, 0.0), axis=1)
         count = self._settings.contour_points

@@ -8,8 +8,9 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sidelong.detection.appearance import AppearanceModel, explained_variance
+from sidelong.detection.appearance import AppearanceModel, explained_variance, smoothed
 from sidelong.detection.clusters import cluster, distinct, softmax, uncovered
 from sidelong.detection.contours import ContourModel, EdgeField
 from sidelong.detection.matcher_process import MatcherProcess, Matches
@@ -47,6 +48,14 @@ class _Models:
     matcher: MatcherProcess
     contours: ContourModel
     appearance: AppearanceModel
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """What the image says: its edges, and its grey values without noise (H, W)."""
+
+    edges: EdgeField
+    smooth: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +136,11 @@ class Line2DDetector:
         matches = models.matcher.match(self._resized(image, models.templates.focal_px))
         matched = time.monotonic()
         clusters = self._clusters(matches, models.templates)
-        field = EdgeField(image)
+        evidence = _Evidence(EdgeField(image), smoothed(image))
         # a few poses decide whether a cluster is an object; only then the others are worth their time
-        first = [self._candidate(poses[:FIRST_POSES], None, image, field, models) for poses in clusters]
+        first = [self._candidate(poses[:FIRST_POSES], None, evidence, models) for poses in clusters]
         objects = [
-            self._candidate(clusters[index][FIRST_POSES:], first[index], image, field, models)
+            self._candidate(clusters[index][FIRST_POSES:], first[index], evidence, models)
             for index in self._free(first)
         ]
         objects = [objects[index] for index in self._free(objects)][: self._settings.max_objects]
@@ -191,15 +200,18 @@ class Line2DDetector:
         return clusters
 
     def _candidate(
-        self, poses: FloatArray, known: _Candidate | None, image: GrayImage, field: EdgeField, models: _Models
+        self, poses: FloatArray, known: _Candidate | None, evidence: _Evidence, models: _Models
     ) -> _Candidate:
         """Align and score poses (K, 4, 4), and merge them with those ``known`` of the same cluster."""
         if len(poses) == 0 and known is not None:
             return known
-        poses = models.contours.align(field, self._camera, poses)
+        edges = evidence.edges
+        poses = models.contours.align(edges, self._camera, poses)
         look = models.appearance.look(poses)
         # both are 0..1: contours place the part exactly, appearance tells its ends and faces apart
-        scores = 50 * (models.contours.agreement(field, self._camera, poses) + explained_variance(look, image))
+        scores = 50 * (
+            models.contours.agreement(edges, self._camera, poses) + explained_variance(look, evidence.smooth)
+        )
         silhouettes = [uv[covered] for uv, covered in zip(look.uv, look.covered, strict=True)]
         if known is not None:
             poses, scores = np.concatenate([known.poses, poses]), np.concatenate([known.scores, scores])

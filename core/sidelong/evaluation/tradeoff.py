@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,8 +63,8 @@ def summarise(rows: Sequence[Row]) -> list[Point]:
     return points
 
 
-def draw(points: Sequence[Point], path: Path) -> None:
-    """Draw completeness against views, seconds of computing and seconds of cell time; write a PNG."""
+def draw(points: Sequence[Point], title: str) -> bytes:
+    """Draw completeness against views, seconds of computing and seconds of cell time; return a PNG."""
     from matplotlib.figure import Figure
 
     figure: Any = Figure(figsize=(12, 3.8), dpi=110, layout="constrained")
@@ -83,4 +83,7 @@ def draw(points: Sequence[Point], path: Path) -> None:
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("completeness, %")
     axes[0].legend()
-    figure.savefig(path, format="png")
+    figure.suptitle(title)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png")
+    return picture.getvalue()
