@@ -146,7 +146,7 @@ def build_stages(
     """
     detector = GivenObjects(objects) if objects is not None else _trained(recipe, part, rig, cache_dir, progress)
     strategy = strategy_of(recipe.planning.strategy, recipe.planning.seed)
-    left_out = _left_out(recipe, given=objects is not None)
+    left_out = _left_out(recipe, part, given=objects is not None)
     return Stages(part, rig, detector, strategy, light_model(recipe, part), left_out)
 
 
@@ -175,7 +175,7 @@ def _trained(
     return detector
 
 
-def _left_out(recipe: Recipe, *, given: bool) -> tuple[str, ...]:
+def _left_out(recipe: Recipe, part: Part, *, given: bool) -> tuple[str, ...]:
     """Name the terms that are not computed, each with the reason."""
     terms = {
         "detection: left out, the poses are given": given,
@@ -189,4 +189,8 @@ def _left_out(recipe: Recipe, *, given: bool) -> tuple[str, ...]:
         "ambient light: left out, the projector outshines it (paper, equation (1))": True,
         "inter-reflection: left out, not modelled yet": True,
     }
-    return tuple(term for term, applies in terms.items() if applies)
+    stand_ins = (
+        f"reflectance of {name}: left out, none is known, {recipe.light.stand_in} stands in"
+        for name in recipe.light.unknown(part.materials)
+    )
+    return (*(term for term, applies in terms.items() if applies), *stand_ins)

@@ -44,6 +44,9 @@ class LightSettings(BaseModel):
     materials: dict[str, MaterialSettings] = Field(
         default_factory=dict[str, MaterialSettings], description="by name; the paper's three are known"
     )
+    stand_in: str | None = Field(
+        default="stainless", description="material taken for one whose reflectance is not known; none: refuse the part"
+    )
 
     def response(self) -> Response:
         """Return the sensor's response."""
@@ -55,12 +58,22 @@ class LightSettings(BaseModel):
         Raises
         ------
         SettingsError
-            A material is unknown.
+            A material is unknown and nothing may stand in, or the stand-in is unknown.
         """
-        known = PAPER_MATERIALS | {name: Phong(m.k_d, m.k_s, m.n) for name, m in self.materials.items()}
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            raise SettingsError(
-                f"light.materials: no reflectance for material {unknown[0]!r}; known are {', '.join(sorted(known))}"
-            )
-        return tuple(known[name] for name in names)
+        known = self._known()
+        stand_in = known.get(self.stand_in or "")
+        found = [known.get(name, stand_in) for name in names]
+        for name, reflectance in zip(names, found, strict=True):
+            if reflectance is None:
+                raise SettingsError(
+                    f"light.materials: no reflectance for material {name!r} nor for light.stand_in, "
+                    f"{self.stand_in!r}; known are {', '.join(sorted(known))}"
+                )
+        return tuple(reflectance for reflectance in found if reflectance is not None)
+
+    def unknown(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the materials for which the stand-in is taken."""
+        return tuple(name for name in names if name not in self._known())
+
+    def _known(self) -> dict[str, Phong]:
+        return PAPER_MATERIALS | {name: Phong(m.k_d, m.k_s, m.n) for name, m in self.materials.items()}
