@@ -14,7 +14,7 @@ from sidelong.detection.settings import DetectionSettings
 from sidelong.physics.sensing import SensingSettings
 from sidelong.planning.light import DEFAULT_INTENSITY, LightSettings
 from sidelong.planning.selection import Strategy, StrategyName, strategy_of
-from sidelong.types import DetectedObject, GrayImage
+from sidelong.types import DetectedObject, FloatArray, GrayImage
 
 if TYPE_CHECKING:  # the service reads recipes without open3d
     from sidelong.geometry.camera_model import StereoRig
@@ -56,8 +56,8 @@ class Recipe(BaseModel):
 class Detector(Protocol):
     """Finds objects in the projector-off image of the reference view."""
 
-    def detect(self, image: GrayImage) -> tuple[DetectedObject, ...]:
-        """Return the objects, none where nothing was found."""
+    def detect(self, image: GrayImage, depth_m: FloatArray | None = None) -> tuple[DetectedObject, ...]:
+        """Return the objects, none where nothing was found; ``depth_m`` (H, W) was measured from the same place."""
         ...
 
     def close(self) -> None:
@@ -71,7 +71,7 @@ class GivenObjects:
 
     objects: tuple[DetectedObject, ...]
 
-    def detect(self, image: GrayImage) -> tuple[DetectedObject, ...]:
+    def detect(self, image: GrayImage, depth_m: FloatArray | None = None) -> tuple[DetectedObject, ...]:
         """Return the given objects, whatever the image."""
         return self.objects
 

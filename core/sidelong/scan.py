@@ -56,7 +56,7 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
 
     # 1: Line2D, I_o -> {q}
     with stopwatch.stage("detect"):
-        objects = stages.detector.detect(image.left)
+        objects = stages.detector.detect(image.left, completion.depth_m)
 
     # 2: prior, {q} -> {D, N} at the missing pixels
     with stopwatch.stage("score"):

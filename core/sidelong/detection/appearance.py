@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sidelong.detection.settings import DetectionSettings
+from sidelong.detection.shading import brightness
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.raycast import RayScene
@@ -28,11 +30,24 @@ RIDGE = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What poses look like: pixels (K, Q, 2), which of them the part covers (K, Q), normals in the camera (K, Q, 3)."""
+    """What poses look like on a disc of pixels around each.
+
+    Attributes
+    ----------
+    uv
+        (K, Q, 2) pixels.
+    covered
+        (K, Q) which of them the part covers.
+    normals
+        (K, Q, 3) in the camera's frame; zero where not covered.
+    depth_m
+        (K, Q) of the part's surface; NaN where not covered.
+    """
 
     uv: FloatArray
     covered: BoolArray
     normals: FloatArray
+    depth_m: FloatArray
 
 
 class AppearanceModel:
@@ -59,7 +74,8 @@ class AppearanceModel:
         hits = self._scene.cast(origins, directions)
         covered = hits.instance >= 0
         normals = np.where(covered[..., None], hits.normals, 0.0) @ np.swapaxes(rotation, 1, 2)
-        return Look(uv, covered, normals)
+        # directions are scaled to z = 1 in the camera
+        return Look(uv, covered, normals, np.where(covered, hits.distance, np.nan))
 
 
 def smoothed(image: GrayImage, blur_px: float = 1.3) -> NDArray[np.float32]:
@@ -69,29 +85,43 @@ def smoothed(image: GrayImage, blur_px: float = 1.3) -> NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur_px), dtype=np.float32)
 
 
-def explained_variance(look: Look, smooth: NDArray[np.float32]) -> FloatArray:
+def grey_around(look: Look, smooth: NDArray[np.float32]) -> FloatArray:
+    """Return the grey values (K, Q) of an image from ``smoothed``, less the mean of each row."""
+    import cv2
+
+    remap: Any = cv2.remap  # its stub forbids the None that means: coordinates are in one array
+    where = look.uv.astype(np.float32)
+    grey = remap(smooth, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+    return grey - grey.mean(axis=1, keepdims=True)
+
+
+def explained_variance(look: Look, grey: FloatArray) -> FloatArray:
     """Return the share (K,) 0..1 of the grey values' variance that normals and silhouette explain.
 
     Parameters
     ----------
     look
         What the poses look like.
-    smooth
-        (H, W) from ``smoothed``.
+    grey
+        (K, Q) from ``grey_around``.
     """
-    import cv2
-
-    remap: Any = cv2.remap  # its stub forbids the None that means: coordinates are in one array
-    sampled = remap(smooth, look.uv.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(
-        np.float64
-    )
-    grey: FloatArray = sampled - sampled.mean(axis=1, keepdims=True)
     basis = np.concatenate([_cubic(look.normals) * look.covered[..., None], ~look.covered[..., None]], axis=-1)
     moments = np.swapaxes(basis, 1, 2) @ basis + RIDGE * np.eye(basis.shape[-1])
     fitted: Any = np.linalg.solve(moments, np.swapaxes(basis, 1, 2) @ grey[..., None])
     residual: FloatArray = grey - (basis @ fitted)[..., 0]
     total = (grey**2).sum(axis=1)
     return np.clip(1.0 - (residual**2).sum(axis=1) / np.maximum(total, 1e-9), 0.0, 1.0) * (total > 0)
+
+
+def is_brighter(look: Look, grey: FloatArray, settings: DetectionSettings) -> BoolArray:
+    """Say which poses (K,) find light where their facets should show it, and dark ground around.
+
+    The correlation of the expected brightness with the grey values is above 0. It is far below on the dark walls of a
+    bin, which have a part's width and straight edges.
+    """
+    cosine = np.where(look.covered, -look.normals[..., 2], -1.0)
+    expected = brightness(cosine, settings)
+    return ((expected - expected.mean(axis=1, keepdims=True)) * grey).sum(axis=1) > 0
 
 
 def _cubic(normals: FloatArray) -> FloatArray:

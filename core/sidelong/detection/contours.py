@@ -6,6 +6,7 @@ is the classic search along the contour's normals (Harris, RAPID, 1990), with we
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,7 @@ LEAST_STEP = 0.1
 """Contrast below which an edge is none: facets of a tessellated round are not seen one by one."""
 SEARCH_SPANS = (0.07, 0.07, 0.05, 0.05, 0.035, 0.035, 0.025, 0.025)
 """Half-lengths of the search along the normals, one for each step, in diameters of the part on the image."""
+FINE_SPANS = SEARCH_SPANS[4:]
 SEARCH_STEPS = 6
 DAMPING = 1e-3
 LARGEST_TURN_RAD = 0.15
@@ -81,6 +83,7 @@ class ContourModel:
     def __init__(self, part: Part, settings: DetectionSettings) -> None:
         self._settings = settings
         self._diameter_m = part.diameter_m
+        self._centre_m = part.centre_m
         coarse = simplified(part, MAX_TRIANGLES)
         self._scene = RayScene([(coarse, np.eye(4))])
         edges, faces = _shared_edges(coarse)
@@ -123,18 +126,37 @@ class ContourModel:
         # few visible points prove little: a quarter of the points is the least divisor
         return agreement.sum(axis=1) / np.maximum(contour.visible.sum(axis=1), self._settings.contour_points / 4)
 
-    def align(self, field: EdgeField, camera: PinholeCamera, camera_T_object: FloatArray) -> FloatArray:
-        """Move poses (K, 4, 4) so that their contours lie on edges; return them, (K, 4, 4)."""
+    def align(
+        self,
+        field: EdgeField,
+        camera: PinholeCamera,
+        camera_T_object: FloatArray,
+        limits_m: FloatArray,
+        spans: Sequence[float] = SEARCH_SPANS,
+    ) -> FloatArray:
+        """Move poses (K, 4, 4) so that their contours lie on edges; return them, (K, 4, 4).
+
+        The centres of the parts stay between the distances ``limits_m`` (K, 2). ``spans`` are the half-lengths of the
+        search, one for each step, in diameters of the part on the image.
+        """
         rng = np.random.default_rng(0)
         poses = camera_T_object.copy()
         contour = self.select(poses, rng)
-        for step, span in enumerate(SEARCH_SPANS):
-            if step == len(SEARCH_SPANS) // 2:
+        for step, span in enumerate(spans):
+            if step == len(spans) // 2:
                 contour = self.select(poses, rng)
             seen = project(contour, camera, poses)
             reach_px = span * camera.fx * self._diameter_m / poses[:, 2, 3]
             shift_px, weight = _search(field, seen, reach_px)
-            poses = _moved(poses, _twist(seen, camera, poses, shift_px, weight * contour.visible, self._diameter_m))
+            twist = _twist(seen, camera, poses, shift_px, weight * contour.visible, self._diameter_m)
+            poses = self._kept_between(_moved(poses, twist), limits_m)
+        return poses
+
+    def _kept_between(self, poses: FloatArray, limits_m: FloatArray) -> FloatArray:
+        """Scale poses along their lines of sight until their centres lie between the limits."""
+        centre_m = poses[:, :3, :3] @ self._centre_m + poses[:, :3, 3]
+        wanted_m = np.clip(centre_m[:, 2], limits_m[:, 0], limits_m[:, 1])
+        poses[:, :3, 3] += centre_m * (wanted_m / centre_m[:, 2] - 1.0)[:, None]
         return poses
 
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sidelong.detection.appearance import AppearanceModel, explained_variance, smoothed
 from sidelong.detection.clusters import cluster, distinct, softmax, uncovered
-from sidelong.detection.contours import ContourModel, EdgeField
+from sidelong.detection.depth_evidence import DistanceBounds
 from sidelong.detection.matcher_process import MatcherProcess, Matches
 from sidelong.detection.settings import DetectionSettings
 from sidelong.detection.template_cache import load_or_train
 from sidelong.detection.templates import Progress, TemplateSet, pose_on_ray
+from sidelong.detection.verification import Evidence, Starts, Verified, Verifier
 from sidelong.errors import ImageError
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
@@ -46,25 +46,7 @@ class _Models:
 
     templates: TemplateSet
     matcher: MatcherProcess
-    contours: ContourModel
-    appearance: AppearanceModel
-
-
-@dataclass(frozen=True, eq=False)
-class _Evidence:
-    """What the image says: its edges, and its grey values without noise (H, W)."""
-
-    edges: EdgeField
-    smooth: NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """Aligned poses (K, 4, 4) of one cluster, their scores (K,) best first, and their silhouettes (Q, 2) px."""
-
-    poses: FloatArray
-    scores: FloatArray
-    silhouettes_px: tuple[FloatArray, ...]
+    verifier: Verifier
 
 
 class Line2DDetector:
@@ -118,31 +100,51 @@ class Line2DDetector:
         """
         self._prepared(progress)
 
-    def detect(self, image: GrayImage) -> tuple[DetectedObject, ...]:
-        """Return the objects in the image (H, W), best first, each with its hypotheses; () where there is none.
+    def detect(self, image: GrayImage, depth_m: FloatArray | None = None) -> tuple[DetectedObject, ...]:
+        """Find the part in an image.
+
+        Parameters
+        ----------
+        image
+            (H, W) 8-bit grey.
+        depth_m
+            (H, W) what was measured from the same place, NaN where missing: it bounds the distances.
+
+        Returns
+        -------
+        tuple of DetectedObject
+            Best first, each with its hypotheses; () where there is none.
 
         Raises
         ------
         ImageError
-            Not an 8-bit grey image of the camera's size.
+            Not an 8-bit grey image, or a depth map, of the camera's size.
         MatcherDiedError
             The child process died or missed its deadline; the next call starts another one.
         """
-        self._check(image)
+        self._check(image, depth_m)
         if image.min() == image.max():
             return ()
         models = self._prepared()
         started = time.monotonic()
         matches = models.matcher.match(self._resized(image, models.templates.focal_px))
         matched = time.monotonic()
-        clusters = self._clusters(matches, models.templates)
-        evidence = _Evidence(EdgeField(image), smoothed(image))
+        bounds = DistanceBounds(depth_m, self._settings.distance_m, self._part.diameter_m)
+        clusters = self._clusters(matches, models.templates, bounds)
+        evidence = Evidence(image, depth_m)
+
+        def verified(starts: list[Starts], known: list[Verified]) -> list[Verified]:
+            """Verify all at once, and merge each with what is known of it already."""
+            found = models.verifier.verify(Starts.joined(starts), evidence)
+            ends = np.cumsum([0, *(len(each.poses) for each in starts)])
+            mine = (found[first:last] for first, last in pairwise(ends.tolist()))
+            return [self._merged([old, new]) for old, new in zip(known, mine, strict=True)]
+
         # a few poses decide whether a cluster is an object; only then the others are worth their time
-        first = [self._candidate(poses[:FIRST_POSES], None, evidence, models) for poses in clusters]
-        objects = [
-            self._candidate(clusters[index][FIRST_POSES:], first[index], evidence, models)
-            for index in self._free(first)
-        ]
+        nothing = Verified.joined([])
+        first = verified([starts[:FIRST_POSES] for starts in clusters], [nothing] * len(clusters))
+        free = self._free(first)
+        objects = verified([clusters[index][FIRST_POSES:] for index in free], [first[index] for index in free])
         objects = [objects[index] for index in self._free(objects)][: self._settings.max_objects]
         self.last_report = DetectionReport(
             matches.total, len(matches.row), len(clusters), matched - started, time.monotonic() - matched
@@ -155,12 +157,11 @@ class Line2DDetector:
             self._models = _Models(
                 templates,
                 MatcherProcess(templates, self._settings),
-                ContourModel(self._part, self._settings),
-                AppearanceModel(self._part, self._camera),
+                Verifier(self._part, self._camera, self._settings),
             )
         return self._models
 
-    def _check(self, image: GrayImage) -> None:
+    def _check(self, image: GrayImage, depth_m: FloatArray | None) -> None:
         if image.dtype != np.uint8:
             raise ImageError(f"detection: the image's type is {image.dtype}, needs uint8")
         if image.ndim != 2:
@@ -171,6 +172,8 @@ class Line2DDetector:
                 f"detection: the image is {width}x{height} px, "
                 f"the camera's are {self._camera.width}x{self._camera.height} px"
             )
+        if depth_m is not None and depth_m.shape != image.shape:
+            raise ImageError(f"detection: the depth map is {depth_m.shape}, the image {image.shape}")
 
     def _resized(self, image: GrayImage, focal_px: float) -> GrayImage:
         """Return the image as a camera with square pixels and the templates' focal length sees it."""
@@ -183,45 +186,41 @@ class Line2DDetector:
         shrinks = focal_px < self._camera.fx
         return cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR).astype(np.uint8)
 
-    def _clusters(self, matches: Matches, templates: TemplateSet) -> list[FloatArray]:
-        """Return the distinct poses (K, 4, 4) of each cluster, best match first."""
+    def _clusters(self, matches: Matches, templates: TemplateSet, bounds: DistanceBounds) -> list[Starts]:
+        """Return the distinct poses of each cluster, best match first."""
         settings, camera = self._settings, self._camera
         scale = templates.focal_px / np.array([camera.fx, camera.fy])
         # (corner + 1/2) / scale - 1/2 moves pixel centres between the sizes
         uv = (matches.corner_px + templates.centre_px[matches.row] + 0.5) / scale - 0.5
         distance_m, rotation = templates.distance_m[matches.row], templates.axis_R_object[matches.row]
-        radius_px = settings.cluster_radius * camera.fx * self._part.diameter_m / distance_m
+        diameter_px = camera.fx * self._part.diameter_m / distance_m
+        near_m, far_m = bounds.at(uv, diameter_px / 2)
+        half_step = np.sqrt(settings.distance_ratio)
+        possible = (distance_m * half_step >= near_m) & (distance_m / half_step <= far_m)
+        row = matches.row[possible]
+        uv, distance_m, rotation, near_m, far_m, diameter_px = (
+            each[possible] for each in (uv, distance_m, rotation, near_m, far_m, diameter_px)
+        )
+        distance_m = np.clip(distance_m, near_m, far_m)
         step_rad, limit = np.radians(settings.pose_step_deg), settings.hypotheses_per_object
-        clusters: list[FloatArray] = []
-        for members in cluster(uv, radius_px, CLUSTERS_PER_OBJECT * settings.max_objects):
+        clusters: list[Starts] = []
+        for members in cluster(uv, settings.cluster_radius * diameter_px, CLUSTERS_PER_OBJECT * settings.max_objects):
+            # one template matches at many places next to each other: its best place stands for them
+            members = members[np.sort(np.unique(row[members], return_index=True)[1])]
             kept = members[distinct(rotation[members], distance_m[members], step_rad, limit)]
             poses = [pose_on_ray(uv[k], camera, rotation[k], float(distance_m[k]), self._part.centre_m) for k in kept]
-            clusters.append(np.array(poses))
+            clusters.append(Starts(np.array(poses), np.stack([near_m[kept], far_m[kept]], axis=-1)))
         return clusters
 
-    def _candidate(
-        self, poses: FloatArray, known: _Candidate | None, evidence: _Evidence, models: _Models
-    ) -> _Candidate:
-        """Align and score poses (K, 4, 4), and merge them with those ``known`` of the same cluster."""
-        if len(poses) == 0 and known is not None:
-            return known
-        edges = evidence.edges
-        poses = models.contours.align(edges, self._camera, poses)
-        look = models.appearance.look(poses)
-        # both are 0..1: contours place the part exactly, appearance tells its ends and faces apart
-        scores = 50 * (
-            models.contours.agreement(edges, self._camera, poses) + explained_variance(look, evidence.smooth)
-        )
-        silhouettes = [uv[covered] for uv, covered in zip(look.uv, look.covered, strict=True)]
-        if known is not None:
-            poses, scores = np.concatenate([known.poses, poses]), np.concatenate([known.scores, scores])
-            silhouettes = [*known.silhouettes_px, *silhouettes]
-        order = np.argsort(-scores, kind="stable")
+    def _merged(self, parts: list[Verified]) -> Verified:
+        """Join hypotheses of one object, best first, like poses once."""
+        found = Verified.joined(parts)
+        order = np.argsort(-found.scores, kind="stable")
         fine_rad = np.radians(self._settings.pose_step_deg) / 3
-        kept = order[distinct(poses[order, :3, :3], poses[order, 2, 3], fine_rad, len(order))]
-        return _Candidate(poses[kept], scores[kept], tuple(silhouettes[k] for k in kept))
+        poses = found.poses[order]
+        return found[order[distinct(poses[:, :3, :3], poses[:, 2, 3], fine_rad, len(order))].tolist()]
 
-    def _free(self, candidates: list[_Candidate]) -> list[int]:
+    def _free(self, candidates: list[Verified]) -> list[int]:
         """Return the positions of the candidates that score well and that no better one covers, best first."""
         order = sorted(range(len(candidates)), key=lambda index: -candidates[index].scores[0])
         good = [index for index in order if candidates[index].scores[0] >= self._settings.min_score]
@@ -233,7 +232,7 @@ class Line2DDetector:
         return [index for index, is_free in zip(good, free, strict=True) if is_free]
 
 
-def _object(candidate: _Candidate, temperature: float) -> DetectedObject:
+def _object(candidate: Verified, temperature: float) -> DetectedObject:
     probabilities = softmax(candidate.scores, temperature)
     return DetectedObject(
         tuple(

@@ -41,7 +41,7 @@ class DetectionSettings(BaseModel):
     """Brightness of the dark facets relative to the bright ones; the background is 0."""
     match_threshold: Annotated[FiniteFloat, Field(ge=50, le=99)] = 72.0
     """Least similarity of a match, 0..100. Chance alone reaches 84 on noise, and 100 finds nothing at all."""
-    max_matches: Annotated[int, Field(ge=1)] = 20_000
+    max_matches: Annotated[int, Field(ge=1)] = 100_000
     """Matches kept, best first; textured images have millions."""
     deadline_s: Annotated[FiniteFloat, Field(gt=0)] = 60.0
     """Time the matcher's process has to load the templates or to answer before it is ended."""
@@ -57,8 +57,12 @@ class DetectionSettings(BaseModel):
     """Points on the contours of a hypothesis that alignment and score look at."""
     overlap: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.3
     """An object whose silhouette is covered further than this by a better object's is a false alarm."""
-    min_score: Annotated[FiniteFloat, Field(ge=0, le=100)] = 50.0
+    min_score: Annotated[FiniteFloat, Field(ge=0, le=100)] = 40.0
     """Score the best hypothesis of an object needs: the mean of contour agreement and explained variance, percent."""
+    brighter_than_ground: bool = True
+    """Whether facets that face the viewer are brighter than what the part lies on; off for black parts."""
+    depth_tolerance: Annotated[FiniteFloat, Field(gt=0, le=10)] = 0.15
+    """How far a measured depth may differ from a hypothesis before it speaks against it, in diameters of the part."""
     temperature: Annotated[FiniteFloat, Field(gt=0)] = 4.0
     """Of the softmax over the hypotheses of an object, on the 0..100 scale of the scores."""
 

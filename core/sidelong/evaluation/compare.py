@@ -83,9 +83,11 @@ def compare_reference(
     Thresholds of the gain are set aside: every run takes ``recipe.planning.max_views`` views if it can.
     """
     watch = Stopwatch()
-    image = cell.camera.capture(CaptureRequest(Projector.OFF, recipe.image_exposure_s), cell.reference.base_T_camera)
+    pose = cell.reference.base_T_camera
+    image = cell.camera.capture(CaptureRequest(Projector.OFF, recipe.image_exposure_s), pose)
+    measured = cell.camera.capture(CaptureRequest(Projector.DOTS, recipe.depth_exposure_s, depth=True), pose)
     with watch.stage("detect"):
-        objects = stages.detector.detect(image.left)
+        objects = stages.detector.detect(image.left, measured.depth_m)
     detect_s = watch.lap()["detect"]
     for run in runs:
         planning = recipe.planning.model_copy(

@@ -220,7 +220,8 @@ def test_alignment_brings_near_poses_back():
         axis = np.random.default_rng(seed).normal(size=3)
         start[:3, :3] = rotation_about(axis, np.radians(3)) @ truth[:3, :3]
         start[:3, 3] += (0.001, -0.001, 0.012)
-    aligned = ContourModel(bracket(), SETTINGS).align(field, camera, starts)
+    anywhere_m = np.tile([0.3, 1.5], (len(starts), 1))
+    aligned = ContourModel(bracket(), SETTINGS).align(field, camera, starts, anywhere_m)
     turns = [np.degrees(rotation_angle(pose[:3, :3].T @ truth[:3, :3])) for pose in aligned]
     off_px = np.linalg.norm(camera.project(aligned[:, :3, 3]) - camera.project(truth[:3, 3]), axis=1)
     # tilts of a part seen nearly face on are the weak direction: the median, not each
