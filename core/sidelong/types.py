@@ -59,8 +59,10 @@ class Frame:
     depth_m
         Depth along the optical axis of the left camera (H, W), NaN where nothing was measured; None where the capture
         was not asked for depth.
-    projector, exposure_s
-        What was applied, not what was asked for.
+    projector
+        What it showed in the images, not what was asked for.
+    exposure_s
+        Applied exposure: of the depth map where there is one, else of the images.
     started_s, ended_s
         Monotonic clock.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -46,9 +47,9 @@ class _Recording:
         UnknownNameError, DatasetError, PoseError
             The scene does not exist, or a file of it cannot be used.
         """
+        self.close()
         scene = Dataset(self.settings.root).scene(self.settings.object, self.settings.scene)
-        self._views = scene.views()
-        self._scene = scene
+        self._views, self._scene = scene.views(), scene
 
     def close(self) -> None:
         """Forget the scene."""
@@ -105,8 +106,11 @@ class ReplayCamera:
 
     def open(self) -> None:
         """Read the scene's list, poses and intrinsics. Raises an InputError where it cannot be used."""
-        self._recording.open()
-        _ = self.rig
+        with ExitStack() as undo:
+            undo.callback(self.close)
+            self._recording.open()
+            _ = self.rig
+            undo.pop_all()
 
     def close(self) -> None:
         """Forget the scene. Harmless when repeated or never opened."""
@@ -139,7 +143,7 @@ class ReplayCamera:
         if left is None:
             raise ImageError(f"{scene.folder}: view {view.name} has no left image with the projector at {shown}")
         return Frame(
-            view=view,
+            view=View(view.name, pose),
             left=left,
             right=scene.image(view.name, shown, "RIGHT"),
             depth_m=scene.depth_m(view.name) if request.depth else None,
@@ -178,7 +182,7 @@ class ReplayArm:
         """Return where it is; an arm that is not there has no joints."""
         if self._at is None:
             raise DeviceUnavailableError(self.name, "is not open")
-        return ArmState(self._at.base_T_camera, np.zeros(0), moving=False, stamp_s=time.monotonic())
+        return ArmState(self._at.base_T_camera.copy(), np.zeros(0), moving=False, stamp_s=time.monotonic())
 
     def unreachable(self, base_T_flange: FloatArray) -> str | None:
         """Say that nothing was recorded at this pose; None where something was."""

@@ -22,6 +22,9 @@ from sidelong_drivers.registry import create_camera
 from sidelong_service.messages import CellJob, Job, RecordingJob
 from sidelong_service.settings import CellSettings, DriverSettings
 
+AROUND_TARGET_M = 0.08
+"""How far before and behind the target of the views parts may lie."""
+NEAREST_M = 0.05
 CAD_SUFFIXES = (".stl", ".obj", ".ply", ".off")
 
 
@@ -50,22 +53,35 @@ def plan_of(job: Job, recipe: Recipe) -> Plan:
 
 
 def effective_recipe(job: Job, recipe: Recipe, part: Part) -> Recipe:
-    """Fit what a recipe leaves open: the projector's intensity, where recorded data have a white capture.
+    """Return a recipe with what it leaves open filled in.
+
+    The distances of the templates come from the reference view or the recorded depth; the projector's intensity is
+    fitted where recorded data have a white capture.
 
     Raises
     ------
     InputError
-        The capture cannot be used.
+        A recorded file cannot be used.
     """
-    if isinstance(job, CellJob) or recipe.light.intensity is not None:
-        return recipe
+    if isinstance(job, CellJob):
+        distance_m = job.cell.dome.distances_m[0]
+        return _reaching(recipe, (distance_m - AROUND_TARGET_M, distance_m + AROUND_TARGET_M))
     dataset = Dataset(job.root)
-    white = dataset.white_capture(job.object)
+    if recipe.detection.distance_m is None:
+        recipe = _reaching(recipe, dataset.scene(job.object, job.scene).distance_range_m())
+    white = dataset.white_capture(job.object) if recipe.light.intensity is None else None
     if white is None:
         return recipe
     fit = fit_intensity(white.frame, white.base_T_objects, part, dataset.rig, light_model(recipe, part))
     light = recipe.light.model_copy(update={"intensity": fit.intensity})
     return recipe.model_copy(update={"light": light})
+
+
+def _reaching(recipe: Recipe, distances_m: tuple[float, float] | None) -> Recipe:
+    if distances_m is None:
+        return recipe
+    near_m, far_m = distances_m
+    return recipe.model_copy(update={"detection": recipe.detection.reaching(max(near_m, NEAREST_M), far_m)})
 
 
 class Cameras:

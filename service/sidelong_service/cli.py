@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from pydantic import ValidationError
 from rich.console import Console
+from rich.markup import escape
 
 from sidelong.errors import SidelongError
 from sidelong.planning.selection import StrategyName
@@ -48,7 +49,8 @@ def plain_errors() -> Generator[None]:
     try:
         yield
     except (CommandError, ClientError, SidelongError, OSError) as error:
-        err.print(f"[bold red]error[/]: {error}", highlight=False, soft_wrap=True)
+        # paths may hold what rich takes for markup
+        err.print("[bold red]error[/]:", escape(str(error)), highlight=False, soft_wrap=True)
         raise typer.Exit(1) from error
 
 
@@ -175,7 +177,7 @@ def _compare(comparison: Comparison, json_file: Path | None, plot: Path) -> None
     out.print(comparison_table(points))
     write_whole(plot, draw(points, f"{', '.join(dict.fromkeys(row.object for row in rows))}: {len(rows)} rows"))
     for file in (plot, *([json_file] if json_file is not None else [])):
-        out.print(f"  {file}", highlight=False, soft_wrap=True)
+        out.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
     if interrupted:
         raise typer.Exit(130)
 
@@ -245,7 +247,7 @@ def _conclude(progress: ScanProgress, files: list[Path], ending: str) -> None:
         out.print(view_table(progress.views))
     out.print(f"ended: {ending}", highlight=False)
     for file in files:
-        out.print(f"  {file}", highlight=False, soft_wrap=True)
+        out.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _request(

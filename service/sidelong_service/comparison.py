@@ -73,28 +73,25 @@ class Comparison:
         SidelongError
             A file cannot be used, or detection failed.
         """
-        for object_name in dict.fromkeys(case.object for case in self.cases):
-            mine = [case for case in self.cases if case.object == object_name]
-            part = self.dataset.part(object_name)
-            job = RecordingJob(root=self.dataset.root, object=object_name, scene=mine[0].scene, reference=None)
+        for object_name, number in dict.fromkeys((case.object, case.scene) for case in self.cases):
+            scene, part = self.dataset.scene(object_name, number), self.dataset.part(object_name)
+            job = RecordingJob(root=self.dataset.root, object=object_name, scene=number, reference=None)
             recipe = effective_recipe(job, self.recipe, part)
             given: tuple[DetectedObject, ...] | None = () if self.true_poses else None
             with build_stages(
                 recipe, part, self.dataset.rig, self.cache_dir, objects=given, progress=progress
             ) as stages:
-                for number in dict.fromkeys(case.scene for case in mine):
-                    scene = self.dataset.scene(object_name, number)
-                    here = [case for case in mine if case.scene == number]
-                    yield from self._scene_rows(scene, here, (part, recipe, stages), skipped)
+                cases = [case for case in self.cases if (case.object, case.scene) == (object_name, number)]
+                yield from self._scene_rows(scene, cases, (recipe, stages), skipped)
 
     def _scene_rows(
         self,
         scene: Scene,
         cases: Sequence[Case],
-        planned: tuple[Part, Recipe, Stages],
+        planned: tuple[Recipe, Stages],
         skipped: Callable[[Case, str], None],
     ) -> Iterator[Row]:
-        part, recipe, stages = planned
+        recipe, stages = planned
         job = RecordingJob(root=self.dataset.root, object=scene.object, scene=scene.number, reference=None)
         camera, arm = create_camera("replay", job.driver_settings()), create_arm("replay", job.driver_settings())
         views = scene.views()
@@ -104,7 +101,7 @@ class Comparison:
             for case in cases:
                 reference = scene.view(case.reference)
                 try:
-                    truth = truth_in(scene, reference, part)
+                    truth = truth_in(scene, reference, stages.part)
                     _ = truth.missing
                 except DepthError as error:
                     skipped(case, str(error))
@@ -131,8 +128,8 @@ def cases_of(
     ------
     UnknownNameError
         There is no such object, scene or view.
-    DatasetError
-        The list of a scene cannot be used.
+    DatasetError, PoseError
+        The list of a scene, or the pose of a named view, cannot be used.
     """
     if not dataset.objects:
         raise UnknownNameError(f"{dataset.root}: the data set has no <Object>/Scene_<k>/")

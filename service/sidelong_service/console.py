@@ -112,14 +112,14 @@ class CountedProgress:
 
     def note(self, text: str) -> None:
         """Print a line above the bars."""
-        self._progress.console.print(text, highlight=False, soft_wrap=True)
+        self._progress.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def comparison_table(points: Sequence[Point]) -> Table:
     """Return the table of a comparison: strategies, completeness after each view, seconds."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("strategy")
-    for name in ("views added", "complete, mean", "complete, lowest", "computing s", "cell s", "references"):
+    table.add_column("\nstrategy", no_wrap=True)
+    for name in ("views\nadded", "complete\nmean", "complete\nlowest", "computing\ns", "cell\ns", "\nreferences"):
         table.add_column(name, justify="right")
     for point in points:
         table.add_row(

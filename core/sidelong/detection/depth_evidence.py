@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sidelong.detection.appearance import Look
+from sidelong.errors import SettingsError
 from sidelong.types import BoolArray, FloatArray
 
 SAMPLES = 7
@@ -43,6 +44,17 @@ class DistanceBounds:
     depth_m: FloatArray | None
     limits_m: tuple[float, float]
     diameter_m: float
+
+    def check(self) -> None:
+        """Raise SettingsError where all that was measured lies outside the limits: no part could be found there."""
+        if self.depth_m is None:
+            return
+        low, high = (float(end[0]) for end in _inner_range(self.depth_m.reshape(1, -1)))
+        if high < self.limits_m[0] or low - self.diameter_m > self.limits_m[1]:
+            raise SettingsError(
+                f"detection.distance_m: is {self.limits_m[0]:.3g} to {self.limits_m[1]:.3g} m, but what was measured "
+                f"lies between {low:.3g} and {high:.3g} m"
+            )
 
     def at(self, uv: FloatArray, radius_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the bounds (M,), (M,) of parts centred at pixels (M, 2) that reach ``radius_px`` (M,) far."""

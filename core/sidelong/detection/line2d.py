@@ -119,6 +119,8 @@ class Line2DDetector:
         ------
         ImageError
             Not an 8-bit grey image, or a depth map, of the camera's size.
+        SettingsError
+            There are no templates for the distances that were measured.
         MatcherDiedError
             The child process died or missed its deadline; the next call starts another one.
         """
@@ -129,7 +131,8 @@ class Line2DDetector:
         started = time.monotonic()
         matches = models.matcher.match(self._resized(image, models.templates.focal_px))
         matched = time.monotonic()
-        bounds = DistanceBounds(depth_m, self._settings.distance_m, self._part.diameter_m)
+        bounds = DistanceBounds(depth_m, self._settings.reach_m, self._part.diameter_m)
+        bounds.check()
         clusters = self._clusters(matches, models.templates, bounds)
         evidence = Evidence(image, depth_m)
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+USUAL_DISTANCE_M = (0.55, 0.95)
+"""Of a camera over a bin, where nothing tells."""
 
 
 class DetectionSettings(BaseModel):
@@ -21,8 +25,9 @@ class DetectionSettings(BaseModel):
     """Angle between neighbouring views of the viewsphere, in elevation and (on the circle) in azimuth."""
     roll_step_deg: Annotated[FiniteFloat, Field(ge=2, le=60)] = 15.0
     """Angle between neighbouring turns in the image plane."""
-    distance_m: tuple[Annotated[FiniteFloat, Field(gt=0)], Annotated[FiniteFloat, Field(gt=0)]] = (0.55, 0.95)
-    """Least and largest distance of a part from the camera."""
+    distance_m: tuple[Annotated[FiniteFloat, Field(gt=0)], Annotated[FiniteFloat, Field(gt=0)]] | None = None
+    """Least and largest distance of a part from the camera in the reference view; none: where the cell or the recorded
+    depth says, else ``USUAL_DISTANCE_M``."""
     distance_ratio: Annotated[FiniteFloat, Field(ge=1.02, le=2)] = 1.12
     """Largest ratio of neighbouring distances: what an image shows changes with the ratio, not the difference."""
     span_px: Annotated[FiniteFloat, Field(ge=24, le=400)] = 60.0
@@ -66,9 +71,25 @@ class DetectionSettings(BaseModel):
     temperature: Annotated[FiniteFloat, Field(gt=0)] = 4.0
     """Of the softmax over the hypotheses of an object, on the 0..100 scale of the scores."""
 
+    @property
+    def reach_m(self) -> tuple[float, float]:
+        """Least and largest distance for which there are templates."""
+        return self.distance_m or USUAL_DISTANCE_M
+
+    def reaching(self, near_m: float, far_m: float) -> DetectionSettings:
+        """Return these settings with ``distance_m`` set, unless it is set already.
+
+        The range is rounded outwards to powers of ``distance_ratio``, so that like scenes share trained templates.
+        """
+        if self.distance_m is not None:
+            return self
+        step = math.log(self.distance_ratio)
+        ends = math.floor(math.log(near_m) / step), math.ceil(math.log(far_m) / step)
+        return self.model_copy(update={"distance_m": (math.exp(step * ends[0]), math.exp(step * ends[1]))})
+
     @model_validator(mode="after")
     def _ordered(self) -> DetectionSettings:
-        if not self.distance_m[0] <= self.distance_m[1]:
+        if not self.reach_m[0] <= self.reach_m[1]:
             raise ValueError(f"distance_m is {self.distance_m}, the first must not exceed the second")
         if not self.dark_cosine < self.bright_cosine:
             raise ValueError(f"dark_cosine is {self.dark_cosine}, must be below bright_cosine, {self.bright_cosine}")

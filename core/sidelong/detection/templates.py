@@ -93,7 +93,7 @@ def view_directions(step_deg: float) -> FloatArray:
 
 def distances(settings: DetectionSettings) -> FloatArray:
     """Return the distances (D,) in metres: the middles of equal ratios that cover the range."""
-    near, far = settings.distance_m
+    near, far = settings.reach_m
     count = max(1, int(np.ceil(np.log(far / near) / np.log(settings.distance_ratio) - 1e-9)))
     return near * (far / near) ** ((np.arange(count) + 0.5) / count)
 
@@ -106,7 +106,7 @@ def rolls_rad(settings: DetectionSettings) -> FloatArray:
 
 def matched_focal_px(part: Part, camera: PinholeCamera, settings: DetectionSettings) -> float:
     """Return the focal length at which the part spans ``span_px`` at the middle (geometric mean) distance."""
-    middle_m = float(np.sqrt(settings.distance_m[0] * settings.distance_m[1]))
+    middle_m = float(np.sqrt(settings.reach_m[0] * settings.reach_m[1]))
     return min(settings.span_px * middle_m / part.diameter_m, LARGEST_UPSCALING * camera.fx)
 
 

@@ -38,6 +38,8 @@ FOLDERS = {Projector.OFF: "Stereo", Projector.DOTS: "StereoPattern", Projector.W
 CAD_SUFFIXES = (".stl", ".ply", ".obj", ".off")
 PROJECTOR_WIDTH_RAD = np.deg2rad(62.0)
 """Assumed where rig.json does not say: an Ensenso lights what its cameras see."""
+LARGEST_NUMBER = 1e12
+"""No length, angle or time in these files comes near; larger ones overflow somewhere."""
 _NOTHING: Mapping[str, Any] = {}
 SAME_PLACE_M, SAME_TURN_RAD = 1e-3, 2e-3
 """How far the pose of a true depth map may be from that of its view: the arm came back to it, after spraying."""
@@ -141,10 +143,10 @@ class Dataset:
 
     def _camera(self, side: str) -> PinholeCamera:
         path, values = self._yml(side), self._intrinsics[side]
-        width, height = (_number(values, name, path) for name in ("width", "height"))
+        width, height = (_count(values, name, path) for name in ("width", "height"))
         numbers = {name: _number(values, name, path, positive=False) for name in ("fx", "fy", "cx", "cy")}
         try:
-            return PinholeCamera(int(width), int(height), **numbers)
+            return PinholeCamera(width, height, **numbers)
         except SettingsError as error:
             raise DatasetError(f"{path}: {error}") from error
 
@@ -221,6 +223,21 @@ class Scene:
     def depth_m(self, name: str) -> FloatArray:
         """Read the measured depth (H, W) of a view, NaN where missing. Raises ImageError."""
         return self._depth(self._file("Depth", f"DEPTH_{name}.png"))
+
+    def distance_range_m(self) -> tuple[float, float] | None:
+        """Return the distances between which nearly all of the scene was measured; None where nothing was.
+
+        Raises
+        ------
+        ImageError, DatasetError
+            A depth map cannot be read.
+        """
+        ends: list[FloatArray] = []
+        for name in self.names:
+            depth_m = self.depth_m(name)[::4, ::4]
+            if np.isfinite(depth_m).any():
+                ends.append(np.percentile(depth_m[np.isfinite(depth_m)], (2, 98)))
+        return (float(min(low for low, _ in ends)), float(max(high for _, high in ends))) if ends else None
 
     def image(self, name: str, projector: Projector, side: str = "LEFT") -> GrayImage | None:
         """Read an image (H, W) of a view, None where it was not recorded. Raises ImageError."""
@@ -354,8 +371,15 @@ def _mapping(content: Any, path: Path) -> Mapping[str, Any]:
 
 def _number(values: Mapping[str, Any], name: str, path: Path, *, positive: bool = True) -> float:
     value = values.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST_NUMBER:
         raise DatasetError(f"{path}: {name} is {value!r:.40}, needs a finite number")
     if positive and value <= 0:
         raise DatasetError(f"{path}: {name} is {value!r:.40}, needs a number greater than 0")
     return float(value)
+
+
+def _count(values: Mapping[str, Any], name: str, path: Path) -> int:
+    number = _number(values, name, path)
+    if number != int(number):
+        raise DatasetError(f"{path}: {name} is {number!r}, needs a whole number")
+    return int(number)

@@ -80,7 +80,10 @@ def draw(points: Sequence[Point], title: str) -> bytes:
             axis.plot(x, y, marker="o", label=strategy.value)
     for axis, label in zip(axes, ("views added", "computing, s", "cell time, s"), strict=True):
         axis.set_xlabel(label)
+        axis.set_xlim(left=0)
         axis.grid(alpha=0.3)
+    axes[0].set_xticks(sorted({point.views_added for point in points}))
+    axes[0].set_ylim(bottom=0)
     axes[0].set_ylabel("completeness, %")
     axes[0].legend()
     figure.suptitle(title)

@@ -30,7 +30,7 @@ def validated_transform(matrix: ArrayLike, name: str) -> FloatArray:
     """
     try:
         a_T_b = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise PoseError(f"{name}: a pose needs 16 numbers, got {matrix!r:.80}") from error
     if a_T_b.size != 16:
         raise PoseError(f"{name}: a pose needs 16 numbers (4x4, row-major), got {a_T_b.size}")

@@ -10,6 +10,7 @@ from sidelong.detection.appearance import AppearanceModel
 from sidelong.detection.depth_evidence import HEAP, DistanceBounds, contradicted, offsets, residuals, sampled
 from sidelong.detection.line2d import Line2DDetector
 from sidelong.detection.settings import DetectionSettings
+from sidelong.errors import SettingsError
 from sidelong.geometry.raycast import RayScene
 from sidelong.types import FloatArray
 
@@ -112,3 +113,24 @@ def test_measured_depth_corrects_the_distance_of_a_detection(tmp_path_factory: p
     ]
     assert max(errors_m[1]) < 4e-3
     assert max(errors_m[1]) < max(errors_m[0])
+
+
+@pytest.mark.parametrize("measured_m", [0.2, 1.4])
+def test_distances_without_templates_are_refused_with_both_ranges(measured_m: float):
+    with pytest.raises(SettingsError, match=rf"detection\.distance_m: is 0\.4 to 1\.2 m, .* between {measured_m}"):
+        DistanceBounds(np.full((60, 80), measured_m), LIMITS_M, DIAMETER_M).check()
+
+
+@pytest.mark.parametrize("measured_m", [0.41, 1.22, np.nan])
+def test_distances_within_reach_and_unknown_ones_are_accepted(measured_m: float):
+    DistanceBounds(np.full((60, 80), measured_m), LIMITS_M, DIAMETER_M).check()
+
+
+def test_settings_reach_what_a_scene_needs_in_steps_that_scenes_share():
+    settings = DetectionSettings(distance_ratio=1.1)
+    near_m, far_m = settings.reaching(0.60, 0.88).reach_m
+    assert 0.60 / 1.1 < near_m <= 0.60
+    assert 0.88 <= far_m < 0.88 * 1.1
+    assert settings.reaching(0.58, 0.90).reach_m == (near_m, far_m)
+    declared = DetectionSettings(distance_m=(0.5, 0.6))
+    assert declared.reaching(0.62, 0.88).reach_m == (0.5, 0.6)

@@ -661,3 +661,12 @@ def test_damage_is_refused_by_the_name_of_the_file(
 @pytest.mark.parametrize("use", dict.fromkeys(use for _, use, _, _ in DAMAGES.values() if use.__name__ != "<lambda>"))
 def test_nothing_is_refused_of_the_copy_before_it_is_damaged(copy: Path, use: Use) -> None:
     assert use(copy) is not None
+
+
+def test_the_range_of_distances_holds_what_was_measured() -> None:
+    scene = Dataset(ROBI).scene("Tube_fitting", 1)
+    near_m, far_m = scene.distance_range_m() or (0.0, 0.0)
+    depths = np.concatenate([scene.depth_m(name).ravel() for name in scene.names])
+    inside = (depths >= near_m) & (depths <= far_m)
+    assert inside.sum() > 0.95 * np.isfinite(depths).sum()
+    assert 0.5 < near_m < far_m < 1.0
