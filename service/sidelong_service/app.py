@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
+import sqlite3
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -14,30 +16,50 @@ from uuid import uuid4
 from fastapi import Depends, FastAPI, Header, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.openapi.utils import get_openapi
-from fastapi.responses import FileResponse, JSONResponse
+from fastapi.responses import FileResponse
 from pydantic import ValidationError
 from sse_starlette import EventSourceResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
+from sidelong_service.answers import ArtifactFile, LocalHosts, answer
 from sidelong_service.events import follow, sse
 from sidelong_service.models import (
+    Artifact,
     ArtifactList,
     CellReport,
     Limit,
     Readiness,
     Scan,
+    ScanEvent,
     ScanList,
     ScanRequest,
     StopReport,
 )
-from sidelong_service.problems import MEDIA_TYPE, Problem, ServiceError, problem, validation_problem
+from sidelong_service.problems import MEDIA_TYPE, Problem, ServiceError, problem, problem_of, validation_problem
 from sidelong_service.settings import ServiceSettings
 from sidelong_service.storage import Storage
 from sidelong_service.storage_thread import StorageThread
 from sidelong_service.supervisor import Supervisor
 
+log = logging.getLogger(__name__)
+
+DATABASE = "sidelong.sqlite"
 LARGEST_BODY = 256 * 1024
 PING_S = 15
+
+_PROBLEM: dict[str, Any] = {
+    "description": "A problem",
+    "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+}
+_EVENTS: dict[str, Any] = {
+    "description": "Server-sent events: id, event (its kind) and data (a ScanEvent as JSON)",
+    "content": {"text/event-stream": {"schema": {"type": "string"}}},
+}
+_FILE: dict[str, Any] = {
+    "description": "The file; a part of it where a Range was asked for",
+    "content": {media_type: {} for media_type in ("application/json", "application/octet-stream", "image/png")},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +77,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncGenerator[None]:
-        storage = StorageThread(settings.data_dir / "sidelong.sqlite")
+        storage = StorageThread(settings.data_dir / DATABASE)
         await storage.open()
         supervisor = Supervisor(settings, storage, new_id=lambda: uuid4().hex)
         app.state.service = Service(settings, storage, supervisor, asyncio.get_running_loop())
@@ -74,7 +96,9 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         # the usual pages load scripts from other hosts
         docs_url=None,
         redoc_url=None,
+        redirect_slashes=False,
     )
+    app.add_middleware(LocalHosts, host=settings.host)
     _add_scan_routes(app)
     _add_cell_routes(app)
     _add_problem_handlers(app)
@@ -116,10 +140,7 @@ FoundScan = Annotated[Scan, Depends(found_scan)]
 
 
 def _documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    schema = {"$ref": "#/components/schemas/Problem"}
-    return {
-        status: {"description": "A problem", "content": {MEDIA_TYPE: {"schema": schema}}} for status in statuses
-    }  # fmt: skip
+    return dict.fromkeys(statuses, _PROBLEM)
 
 
 def _add_scan_routes(app: FastAPI) -> None:
@@ -154,7 +175,11 @@ def _add_scan_routes(app: FastAPI) -> None:
         """Show a scan with its views so far."""
         return scan
 
-    @app.get("/v1/scans/{scan_id}/events", response_class=EventSourceResponse, responses=_documented(404, 422))
+    @app.get(
+        "/v1/scans/{scan_id}/events",
+        response_class=EventSourceResponse,
+        responses={200: _EVENTS, **_documented(404, 422)},
+    )
     async def follow_scan(
         scan: FoundScan,
         service: TheService,
@@ -169,15 +194,29 @@ def _add_scan_routes(app: FastAPI) -> None:
         """List the files of a scan."""
         return ArtifactList(artifacts=scan.artifacts)
 
-    @app.get("/v1/scans/{scan_id}/artifacts/{name}", response_class=FileResponse, responses=_documented(404))
+    @app.get(
+        "/v1/scans/{scan_id}/artifacts/{name}",
+        response_class=FileResponse,
+        responses={200: _FILE, 206: _FILE, **_documented(400, 404, 416)},
+    )
     async def read_artifact(scan: FoundScan, name: str, service: TheService) -> FileResponse:
         """Read a file of a scan."""
         artifact = next((artifact for artifact in scan.artifacts if artifact.name == name), None)
         if artifact is None:
             raise ServiceError(problem("not-found", f"Scan {scan.id} has no file {name!r:.80}.", scan_id=scan.id))
-        path: Path = service.settings.data_dir / "scans" / scan.id / artifact.name
+        path = service.settings.data_dir / "scans" / scan.id / artifact.name
+        _check_file(path, artifact, scan.id)
         headers = {"ETag": f'"{artifact.sha256}"', "X-Content-Type-Options": "nosniff"}
-        return FileResponse(path, media_type=artifact.media_type, headers=headers)
+        return ArtifactFile(path, media_type=artifact.media_type, headers=headers)
+
+
+def _check_file(path: Path, artifact: Artifact, scan_id: str) -> None:
+    """Refuse a file that somebody removed or changed since the scan wrote it."""
+    size_bytes = path.stat().st_size if path.is_file() and not path.is_symlink() else 0
+    if size_bytes != artifact.size_bytes:
+        trouble = f"File {artifact.name} of scan {scan_id} was removed or changed in the data directory"
+        sizes = f"{size_bytes} bytes, {artifact.size_bytes} were written"
+        raise ServiceError(problem("not-found", f"{trouble}: {sizes}.", scan_id=scan_id))
 
 
 def _add_cell_routes(app: FastAPI) -> None:
@@ -207,30 +246,32 @@ def _add_cell_routes(app: FastAPI) -> None:
 def _add_problem_handlers(app: FastAPI) -> None:
     @app.exception_handler(ServiceError)
     async def on_service_error(_request: Request, error: ServiceError) -> Response:
-        return _answer(error.problem)
+        return answer(error.problem)
 
     @app.exception_handler(RequestValidationError)
     async def on_validation_error(_request: Request, error: RequestValidationError) -> Response:
-        return _answer(validation_problem(error.errors()))
+        return answer(validation_problem(error.errors()))
 
     @app.exception_handler(HTTPException)
     async def on_http_error(request: Request, error: HTTPException) -> Response:
         kinds = {404: "not-found", 405: "method-not-allowed"}
         kind = kinds.get(error.status_code, "bad-request")
-        return _answer(problem(kind, f"{request.method} {request.url.path:.200}"), error.headers)
+        return answer(problem(kind, f"{request.method} {request.url.path:.200}"), error.headers)
+
+    @app.exception_handler(sqlite3.Error)
+    async def on_storage_error(_request: Request, error: sqlite3.Error) -> Response:
+        log.error("the database: %s", error)
+        return answer(problem_of(error))
+
+    @app.exception_handler(ClientDisconnect)
+    async def on_disconnect(_request: Request, _error: ClientDisconnect) -> Response:
+        # nobody hears it: the caller went before its body was here
+        return answer(problem("bad-request", "The body ended early."))
 
     @app.exception_handler(Exception)
     async def on_unexpected_error(_request: Request, _error: Exception) -> Response:
         # the server logs the trace; the caller learns nothing of what is inside
-        return _answer(problem("internal", "An unexpected error; the service's log has its trace."))
-
-
-def _answer(trouble: Problem, headers: Any = None) -> JSONResponse:
-    given = dict(headers or {})
-    if trouble.retryable and trouble.status == 503:
-        given["Retry-After"] = "1"
-    content = trouble.model_dump(mode="json", exclude_none=True)
-    return JSONResponse(content, trouble.status, given, media_type=MEDIA_TYPE)
+        return answer(problem("internal", "An unexpected error; the service's log has its trace."))
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
@@ -238,9 +279,22 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
-        for model in (ScanRequest, Problem):
+        for model in (ScanRequest, ScanEvent, Problem):
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(schema.pop("$defs", {}))
             schemas[model.__name__] = schema
+        _correct_responses(document)
         app.openapi_schema = json.loads(json.dumps(document))
     return app.openapi_schema or {}
+
+
+def _correct_responses(document: dict[str, Any]) -> None:
+    """Take out FastAPI's own validation error, which is never sent; any other status comes with a problem."""
+    for operations in document["paths"].values():
+        for operation in operations.values():
+            responses = operation["responses"]
+            if "HTTPValidationError" in json.dumps(responses.get("422")):
+                del responses["422"]
+            responses["default"] = _PROBLEM
+    for name in ("HTTPValidationError", "ValidationError"):
+        document["components"]["schemas"].pop(name, None)

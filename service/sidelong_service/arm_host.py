@@ -7,6 +7,7 @@ the API asks for it, when its heartbeats stop, and when it has gone.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
@@ -101,14 +102,19 @@ class ArmHost:
     def _own_arm(self) -> None:
         try:
             self._arm.open()
-            self._control.send(ArmReady(name=self._arm.name))
+            self._tell(ArmReady(name=self._arm.name))
             while not self._closing.is_set():
                 self._serve_next_worker()
         except SidelongError as error:
-            self._control.send(ArmFailed(problem=problem_of(error)))
+            self._tell(ArmFailed(problem=problem_of(error)))
         finally:
             self._arm.close()
             self._control.end()
+
+    def _tell(self, message: ArmReady | ArmFailed) -> None:
+        # where the API went meanwhile, the main thread hears of it
+        with contextlib.suppress(OSError):
+            self._control.send(message)
 
     def _serve_next_worker(self) -> None:
         self._listener.settimeout(_POLL_S)

@@ -89,7 +89,7 @@ def depth_png(depth_m: FloatArray) -> bytes:
     """Return depth (H, W) as a 16-bit PNG in units of ``DEPTH_UNIT_M``; 0 where missing or beyond its range."""
     import cv2
 
-    held = np.isfinite(depth_m) & (depth_m <= LARGEST_PNG_DEPTH_M)
+    held = (depth_m > 0) & (depth_m <= LARGEST_PNG_DEPTH_M)
     units = np.where(held, np.rint(depth_m / DEPTH_UNIT_M), 0).astype(np.uint16)
     return cv2.imencode(".png", units)[1].tobytes()
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import errno
+import sqlite3
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -42,6 +43,7 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
         "too-large": Kind(413, 1005, "The request body is too large", False, _NOTHING),
         "media-type": Kind(415, 1006, "The request body must be application/json", False, _NOTHING),
         "host": Kind(421, 1007, "This service does not answer for that host name", False, _NOTHING),
+        "range": Kind(416, 1008, "The range lies outside the file", False, _NOTHING),
         "settings": Kind(422, 1101, "A setting is out of its range", False, "Correct the recipe or the configuration."),
         "dataset": Kind(422, 1102, "The data set breaks its layout", False, "Repair or copy the data set again."),
         "image": Kind(422, 1103, "An image is missing or damaged", False, "Repair or copy the data set again."),
@@ -62,7 +64,9 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
         "internal": Kind(500, 5000, "Unexpected error", False, "Report it with the time and the service's log."),
         "worker-died": Kind(500, 5001, "The scan's process died", True, "Start the scan again."),
         "service-restarted": Kind(500, 5002, "The service ended during the scan", True, "Start the scan again."),
-        "storage": Kind(507, 5003, "A file cannot be written", True, "Free disk space, check the data directory."),
+        "storage": Kind(
+            507, 5003, "The data directory cannot be used", True, "Free disk space, check the data directory."
+        ),
     }
 )
 
@@ -85,6 +89,7 @@ KIND_OF_ERROR: Mapping[type[BaseException], str] = MappingProxyType(
         errors.MotionStoppedError: "motion-stopped",
         errors.DeviceError: "device",
         OSError: "storage",
+        sqlite3.Error: "storage",
     }
 )
 
@@ -162,15 +167,22 @@ def problem_of(error: BaseException) -> Problem:
     if isinstance(error, OSError):
         name = errno.errorcode.get(error.errno or 0, type(error).__name__)
         return problem(kind, f"{error.filename or 'a file'}: {error.strerror or 'cannot be written'} ({name})")
+    if isinstance(error, sqlite3.Error):
+        return problem(kind, f"the database: {error}")
     return problem(kind, str(error), device=error.device if isinstance(error, errors.DeviceError) else None)
 
 
 def validation_problem(found: Iterable[Mapping[str, Any]]) -> Problem:
     """Return the problem for pydantic's list of errors; values are shown as short text, NaN and all."""
     fields = tuple(_field_problem(error) for error in found)
-    detail = "; ".join(f"{field.field}: {field.message}" for field in fields[:3])
+    detail = "; ".join(_told(field) for field in fields[:3])
     more = f"; and {len(fields) - 3} more" if len(fields) > 3 else ""
     return problem("validation", detail + more, errors=fields)
+
+
+def _told(field: FieldProblem) -> str:
+    got = "" if field.value is None else f", got {field.value}"
+    return f"{field.field}: {field.message}{got}"
 
 
 def _field_problem(error: Mapping[str, Any]) -> FieldProblem:

@@ -8,15 +8,18 @@ from __future__ import annotations
 import ipaddress
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, JsonValue, ValidationError
 from pydantic_settings import (
     BaseSettings,
+    InitSettingsSource,
     PydanticBaseSettingsSource,
     SettingsConfigDict,
-    YamlConfigSettingsSource,
+)
+from pydantic_settings import (
+    SettingsError as SourceError,
 )
 
 from sidelong.errors import SettingsError
@@ -86,6 +89,8 @@ def load_settings(file: Path | None = None, **overrides: Any) -> ServiceSettings
         The file cannot be read, or a field is unknown or out of its range; names file and field.
     """
 
+    content = {} if file is None else _yaml(file)
+
     class FromFile(ServiceSettings):
         @classmethod
         def settings_customise_sources(
@@ -96,20 +101,32 @@ def load_settings(file: Path | None = None, **overrides: Any) -> ServiceSettings
             dotenv_settings: PydanticBaseSettingsSource,
             file_secret_settings: PydanticBaseSettingsSource,
         ) -> tuple[PydanticBaseSettingsSource, ...]:
-            return init_settings, env_settings, YamlConfigSettingsSource(settings_cls, file)
+            return init_settings, env_settings, InitSettingsSource(settings_cls, content)
 
     source = str(file) if file is not None else "settings"
-    if file is not None and not file.is_file():
-        raise SettingsError(f"{file}: no such configuration file")
     given = {name: value for name, value in overrides.items() if value is not None}
     try:
         return FromFile(**given)
-    except yaml.YAMLError as error:
-        raise SettingsError(f"{source}: is not YAML: {error}") from error
+    except SourceError as error:
+        raise SettingsError(f"environment: {error}: {error.__cause__}") from error
     except ValidationError as error:
         first = error.errors()[0]
         path = ".".join(str(part) for part in first["loc"])
         raise SettingsError(f"{source}: {path}: {first['msg']}, got {first['input']!r:.80}") from error
+
+
+def _yaml(file: Path) -> dict[str, Any]:
+    if not file.is_file():
+        raise SettingsError(f"{file}: no such configuration file")
+    try:
+        content: Any = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise SettingsError(f"{file}: is not YAML: {' '.join(str(error).split())}") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise SettingsError(f"{file}: holds {type(content).__name__}, needs names with values")
+    return {str(name): value for name, value in cast("dict[Any, Any]", content).items()}
 
 
 def check_loopback(host: str) -> None:

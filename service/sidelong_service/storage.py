@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,18 @@ def utc_now() -> datetime:
     return datetime.now(UTC)
 
 
+def check_database(file: Path) -> None:
+    """Open or make the database and look through its pages.
+
+    Raises
+    ------
+    OSError, sqlite3.Error
+        It cannot be made or written, is damaged, or comes from a later version.
+    """
+    with closing(Storage(file)) as storage:
+        storage.check()
+
+
 class Storage:
     """The database. All calls must come from the thread that made it."""
 
@@ -69,6 +81,12 @@ class Storage:
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute("PRAGMA foreign_keys = ON")
         self._migrate()
+
+    def check(self) -> None:
+        """Look through all pages. Raises sqlite3.DatabaseError where they are damaged."""
+        found = str(self._db.execute("PRAGMA quick_check(1)").fetchone()[0])
+        if found != "ok":
+            raise sqlite3.DatabaseError(f"its pages are damaged: {found}")
 
     def close(self) -> None:
         """Close the database."""
@@ -192,6 +210,8 @@ class Storage:
 
     def _migrate(self) -> None:
         version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
+        if version > len(MIGRATIONS):
+            raise sqlite3.DatabaseError(f"its version is {version}, this service knows {len(MIGRATIONS)}")
         for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
             self._db.executescript(f"BEGIN IMMEDIATE; {script} PRAGMA user_version = {number}; COMMIT;")
 

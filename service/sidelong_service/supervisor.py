@@ -31,6 +31,8 @@ STOPPING_S = 15.0
 """What a scan gets to end after a stop, before its worker is killed."""
 CLOSING_S = 0.7
 """The same, where the service ends."""
+STORE_ATTEMPTS, STORE_AGAIN_S = 6, 1.0
+"""How often the end of a scan is stored where the database fails; one that is lost is ``interrupted`` at a restart."""
 
 
 @dataclass(eq=False)
@@ -40,6 +42,7 @@ class ActiveScan:
     id: str
     request: ScanRequest
     job: Job
+    accepted: bool = False
     stop_asked: bool = False
 
 
@@ -78,6 +81,7 @@ class Supervisor:
         self._worker: WorkerLink | None = None
         self._worker_trouble = "is starting"
         self._active: ActiveScan | None = None
+        self._entrance = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self._keepers: list[asyncio.Task[None]] = []
         self._closing = False
@@ -118,6 +122,11 @@ class Supervisor:
         ServiceError
             Another scan is active, the cell is not ready, or the request names what is not there.
         """
+        # whoever comes while another request is checked waits for that: it may be refused, and its id never be a scan's
+        async with self._entrance:
+            return await self._admit(request)
+
+    async def _admit(self, request: ScanRequest) -> str:
         if self._active is not None:
             raise ServiceError(
                 problem("cell-busy", f"Scan {self._active.id} is active.", scan_id=self._active.id)
@@ -130,6 +139,7 @@ class Supervisor:
         try:
             await self._check(scan)
             await self._storage.call(Storage.create, scan.id, request)
+            scan.accepted = True
         except BaseException:
             self._active = None
             raise
@@ -162,15 +172,16 @@ class Supervisor:
         """Report on the cell."""
         cell = self._settings.cell
         reasons = self._hindrances(None)
+        active = self._active.id if self._active is not None and self._active.accepted else None
         if self._active is not None:
-            reasons = (f"scan {self._active.id} is active", *reasons)
+            reasons = (f"scan {active} is active" if active else "a request is being checked", *reasons)
         return CellReport(
             name=cell.name,
             mode="simulated" if cell.simulated else "real",
             state=self._state(),
             camera=cell.camera.driver,
             arm=self._arm_name,
-            active_scan=self._active.id if self._active is not None else None,
+            active_scan=active,
             may_start=not reasons,
             reasons=reasons,
         )
@@ -241,10 +252,23 @@ class Supervisor:
             log.exception("scan %s", scan.id)
             ending = Ending(ScanState.FAILED, problem=problem_of(error))
         try:
-            await self._set_state(scan.id, self._judge(scan, ending))
+            await self._end(scan.id, self._judge(scan, ending))
         finally:
             self._active = None
             self.bulletin.post()
+
+    async def _end(self, scan_id: str, ending: Ending) -> None:
+        """Keep how a scan ended, also where the database is not to be had for a while."""
+        for attempt in range(1, STORE_ATTEMPTS + 1):
+            try:
+                await self._set_state(scan_id, ending)
+            except sqlite3.Error as error:
+                log.error("scan %s: its end, %s, is not stored: %s", scan_id, ending.state, error)
+                if self._closing or attempt == STORE_ATTEMPTS:
+                    raise
+                await asyncio.sleep(STORE_AGAIN_S)
+            else:
+                return
 
     def _judge(self, scan: ActiveScan, ending: Ending) -> Ending:
         """Say how a scan ended: one that was stopped did not fail, whatever error the stop brought about."""
@@ -283,6 +307,11 @@ class Supervisor:
                 await arm.stop()
                 trouble = problem("worker-died", "The scan worker ended during the scan.", scan_id=scan.id)
                 return Ending(ScanState.INTERRUPTED, problem=trouble)
+            except Exception:
+                # nobody follows the worker any more: it may not go on, and the arm may not go on moving
+                worker.kill()
+                await arm.stop()
+                raise
 
     async def _follow(self, scan: ActiveScan, worker: WorkerLink) -> Ending:
         """Keep what the worker tells until it is done."""
