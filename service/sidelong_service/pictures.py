@@ -33,7 +33,7 @@ def draw(record: Record) -> bytes:
         raise ValueError("the record has no reference view yet")
     rows, columns = window = _window(record, last)
     aspect = (rows.stop - rows.start) / (columns.stop - columns.start)
-    figure: Any = Figure(figsize=(13.0, 2 * (6.0 * aspect + 0.4) + 1.2), layout="constrained")
+    figure: Any = Figure(figsize=(13.0, 2 * (4.7 * aspect + 0.4) + 1.0), layout="compressed")
     axes = figure.subplots(2, 2)
     figure.suptitle(_headline(record, last))
     _draw_missing(axes[0, 0], record, first, window)

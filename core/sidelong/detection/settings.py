@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+DistanceM = Annotated[FiniteFloat, Field(ge=0.01, le=20)]
 USUAL_DISTANCE_M = (0.55, 0.95)
 """Of a camera over a bin, where nothing tells."""
 
@@ -25,7 +26,7 @@ class DetectionSettings(BaseModel):
     """Angle between neighbouring views of the viewsphere, in elevation and (on the circle) in azimuth."""
     roll_step_deg: Annotated[FiniteFloat, Field(ge=2, le=60)] = 15.0
     """Angle between neighbouring turns in the image plane."""
-    distance_m: tuple[Annotated[FiniteFloat, Field(gt=0)], Annotated[FiniteFloat, Field(gt=0)]] | None = None
+    distance_m: tuple[DistanceM, DistanceM] | None = None
     """Least and largest distance of a part from the camera in the reference view; none: where the cell or the recorded
     depth says, else ``USUAL_DISTANCE_M``."""
     distance_ratio: Annotated[FiniteFloat, Field(ge=1.02, le=2)] = 1.12
