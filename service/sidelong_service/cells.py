@@ -20,7 +20,7 @@ from sidelong.simulation.parts import simulated_part
 from sidelong.types import View
 from sidelong_drivers.registry import create_camera
 from sidelong_service.messages import CellJob, Job, RecordingJob
-from sidelong_service.settings import CellSettings, DriverSettings
+from sidelong_service.settings import SIMULATED_PART, CellSettings, DriverSettings
 
 AROUND_TARGET_M = 0.08
 """How far before and behind the target of the views parts may lie."""
@@ -131,18 +131,20 @@ def _cell_plan(job: CellJob) -> Plan:
 
 
 def _part_of(cell: CellSettings, name: str) -> Part:
+    files = {file.stem: file for file in _cad_files(cell.parts_dir)} if cell.parts_dir is not None else {}
+    known = cell.parts or (tuple(sorted(files)) if cell.parts_dir is not None else (SIMULATED_PART,))
+    if name not in known:
+        raise UnknownNameError(f"part: {name!r} is unknown, known are {', '.join(known) or 'none'}")
     if cell.parts_dir is None:
         return simulated_part(name)
-    files = [cell.parts_dir / f"{name}{suffix}" for suffix in CAD_SUFFIXES]
-    found = next((file for file in files if file.is_file()), None)
-    if found is None:
-        known = sorted({file.stem for file in _cad_files(cell.parts_dir)})
-        raise UnknownNameError(f"part: {name!r} is unknown, known are {', '.join(known) or 'none'}")
-    return load_part(found)
+    return load_part(files.get(name, cell.parts_dir / f"{name}{CAD_SUFFIXES[0]}"))
 
 
 def _cad_files(folder: Path) -> list[Path]:
-    return [file for file in folder.iterdir() if file.suffix in CAD_SUFFIXES] if folder.is_dir() else []
+    """Return the CAD files of a folder. Of files with one name the preferred suffix comes last: it wins in a dict."""
+    files = folder.iterdir() if folder.is_dir() else ()
+    known = [file for file in files if file.suffix.lower() in CAD_SUFFIXES]
+    return sorted(known, key=lambda file: -CAD_SUFFIXES.index(file.suffix.lower()))
 
 
 def _recording_plan(job: RecordingJob) -> Plan:

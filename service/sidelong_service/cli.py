@@ -38,6 +38,9 @@ Part = Annotated[str | None, typer.Option(help="Part in the configured cell.")]
 RecipeFile = Annotated[Path | None, typer.Option("--recipe", help="JSON file with settings of the scan.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file with settings of the service.")]
 
+FOLDER_ID = "folder"
+"""Id of a data set that is given by its folder: requests name ids, never paths."""
+
 
 class CommandError(Exception):
     """A command cannot do what it was asked for; the message says why."""
@@ -87,12 +90,14 @@ def scan(
 ) -> None:
     """Run one scan, on a service or in this process, and show what each view gave."""
     with plain_errors():
-        request = _request(part, dataset, object_name, scene, reference, recipe)
+        folder = Path(dataset) if dataset is not None and url is None and Path(dataset).is_dir() else None
+        source = FOLDER_ID if folder is not None else dataset
+        request = _request(part, source, object_name, scene, reference, recipe)
         if url is not None:
             with SidelongClient(url) as client:
                 scan_on_service(client, request, output)
         else:
-            _scan_here(request, config, output)
+            _scan_here(request, config, folder, output)
 
 
 @app.command()
@@ -105,7 +110,7 @@ def demo(
 
     with plain_errors():
         out.print("starting the service with the simulated cell ...")
-        with running_service(output / "service") as client:
+        with running_service(output / "service", part) as client:
             scan_on_service(client, ScanRequest(part=part), output)
 
 
@@ -224,12 +229,14 @@ def scan_on_service(client: SidelongClient, request: ScanRequest, output: Path) 
         raise CommandError(f"scan {ended.id} {ended.state}: {why}")
 
 
-def _scan_here(request: ScanRequest, config: Path | None, output: Path) -> None:
-    """Run a scan in this process; Ctrl-C stops the arm."""
+def _scan_here(request: ScanRequest, config: Path | None, folder: Path | None, output: Path) -> None:
+    """Run a scan in this process, of the data set in ``folder`` if there is one; Ctrl-C stops the arm."""
     from sidelong_service.local import LocalScan
     from sidelong_service.settings import load_settings
 
     settings = load_settings(config)
+    if folder is not None:
+        settings = settings.model_copy(update={"datasets": {FOLDER_ID: folder}})
     with ScanProgress(out) as progress:
         files: list[Path] = []
 

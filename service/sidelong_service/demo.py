@@ -10,6 +10,9 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+import yaml
+
+from sidelong_service.artifacts import write_whole
 from sidelong_service.client import ClientError, SidelongClient
 
 READY_S = 60.0
@@ -17,8 +20,8 @@ EXIT_S = 5.0
 
 
 @contextmanager
-def running_service(data_dir: Path) -> Generator[SidelongClient]:
-    """Run a service with the simulated cell on a free loopback port, as long as the ``with`` block lasts.
+def running_service(data_dir: Path, part: str) -> Generator[SidelongClient]:
+    """Run a service on a free loopback port, as long as the ``with`` block lasts; its simulated bin holds one part.
 
     Raises
     ------
@@ -26,8 +29,11 @@ def running_service(data_dir: Path) -> Generator[SidelongClient]:
         It did not become ready.
     """
     port = _free_port()
+    cell = {"camera": {"driver": "simulated", "settings": {"part": part}}, "parts": [part]}
+    config = data_dir / "config.yaml"
+    write_whole(config, yaml.safe_dump({"data_dir": str(data_dir), "cell": cell}).encode())
     process = subprocess.Popen(
-        [sys.executable, "-m", "sidelong_service", "serve", "--port", str(port), "--data", str(data_dir)],
+        [sys.executable, "-m", "sidelong_service", "serve", "--port", str(port), "--config", str(config)],
         # Ctrl-C is for the demonstration, which stops the scan and then the service
         start_new_session=True,
     )

@@ -76,7 +76,8 @@ class LocalScan:
         recording = self._request.recording
         if recording is None:
             return CellJob(cell=self._settings.cell, part=self._request.part or "")
-        root = self._settings.datasets.get(recording.dataset, Path(recording.dataset))
-        if not root.is_dir():
-            raise UnknownNameError(f"dataset: {recording.dataset!r} is neither a configured id nor a folder")
+        root = self._settings.datasets.get(recording.dataset)
+        if root is None:
+            known = ", ".join(sorted(self._settings.datasets)) or "none"
+            raise UnknownNameError(f"dataset: {recording.dataset!r} is neither a folder nor known, known are {known}")
         return RecordingJob(root=root, object=recording.object, scene=recording.scene, reference=recording.reference)

@@ -25,6 +25,7 @@ from pydantic_settings import (
 from sidelong.errors import SettingsError
 from sidelong.planning.candidates import DomeSettings
 
+SIMULATED_PART = "tube_fitting"
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 """Names of parts, data sets, objects and views: never a path."""
@@ -60,6 +61,11 @@ class CellSettings(BaseModel):
         description="hand-eye transform, 4x4, row by row, metres; the default is the simulated camera's mount",
     )
     parts_dir: Path | None = Field(default=None, description="folder of CAD files; none: the simulated parts")
+    parts: tuple[Name, ...] | None = Field(
+        default=None,
+        description=f"parts that may be asked for; none: all in parts_dir, else {SIMULATED_PART}, which lies in the "
+        "simulated bin unless its camera is told otherwise",
+    )
     target_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
         default=(0.5, 0.0, 0.03), description="the point all views look at, base frame"
     )
