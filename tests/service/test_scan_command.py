@@ -26,7 +26,7 @@ def test_a_recorded_scene_is_scanned_in_this_process(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "ended: max_views" in done.stdout
     report = json.loads((tmp_path / "out/report.json").read_text())
-    assert [view["view"] for view in report["views"]][0] == "view_8"
+    assert report["views"][0]["view"] == "view_8"
     assert report["recovered_px"] > 0
     assert np.isfinite(np.load(tmp_path / "out/depth.npz")["depth_m"]).any()
     near_m, far_m = report["recipe"]["detection"]["distance_m"]

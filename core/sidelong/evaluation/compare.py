@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -41,6 +42,7 @@ class Row(BaseModel):
     cell_s: float
     """``compute_s`` and the stated time of each capture and move."""
     stage_s: dict[str, float]
+    """Seconds in each stage since the start of the run, as measured on the recorded views."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +109,12 @@ def _charged(steps: Iterator[Step], detect_s: float) -> Iterator[Step]:
 def _rows(label: Label, run: Run, truth: Truth, steps: Iterator[Step], limits: tuple[int, CellTime]) -> Iterator[Row]:
     """Turn the steps of a run into rows; a run that ended early keeps its last completeness."""
     max_views, time = limits
-    spent_s, row = 0.0, None
+    spent_s, row = Counter[str](), None
     for step in steps:
         # a lap ends with the scores that choose the next view: they are not this view's cost yet
-        compute_s = spent_s + step.stage_s.get("fuse", 0.0)
-        spent_s += sum(step.stage_s.get(stage, 0.0) for stage in COMPUTING)
+        stage_s = spent_s + Counter({stage: s for stage, s in step.stage_s.items() if stage != "score"})
+        compute_s = sum(stage_s[stage] for stage in COMPUTING)
+        spent_s += Counter(step.stage_s)
         row = Row(
             object=label.object,
             scene=label.scene,
@@ -126,14 +129,12 @@ def _rows(label: Label, run: Run, truth: Truth, steps: Iterator[Step], limits: t
             measured_gain_px=step.measured_gain_px,
             compute_s=compute_s,
             cell_s=compute_s + (step.index + 1) * time.capture_s + step.index * time.move_s,
-            stage_s=dict(step.stage_s),
+            stage_s=dict(stage_s),
         )
         if step.index > 0:
             yield row
     if row is not None:
         for index in range(row.views_added + 1, max_views + 1):
             yield row.model_copy(
-                update={
-                    "views_added": index, "view": None, "predicted_gain_px": 0.0, "measured_gain_px": 0.0, "stage_s": {}
-                }
+                update={"views_added": index, "view": None, "predicted_gain_px": 0.0, "measured_gain_px": 0.0}
             )  # fmt: skip
