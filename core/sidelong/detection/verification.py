@@ -102,9 +102,10 @@ class Verifier:
             doubt = contradicted(residuals(look, evidence.depth_m), look.covered, tolerance_m)
         grey = grey_around(look, evidence.smooth)
         agreement = self._contours.agreement(evidence.edges, self._camera, poses)
-        scores = 50 * (agreement + explained_variance(look, grey)) * (1.0 - doubt)
+        appearance = explained_variance(look, grey)
         if self._settings.brighter_than_ground:
-            scores *= is_brighter(look, grey, self._settings)
+            appearance *= is_brighter(look, grey, self._settings)
+        scores = 50 * (agreement + appearance) * (1.0 - doubt)
         silhouettes = tuple(uv[covered] for uv, covered in zip(look.uv, look.covered, strict=True))
         return Verified(poses, scores, silhouettes)
 
