@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sidelong.detection.settings import DetectionSettings
-from sidelong.detection.shading import brightness
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.raycast import RayScene
@@ -26,6 +25,8 @@ GRID = 28
 PADDING = 1.1
 """Radius of the disc looked at, in radii of the part: some background belongs to the evidence."""
 RIDGE = 1e-2
+LEAST_FACING = 0.05
+"""Share of a part's pixels that must face the viewer to tell how bright such facets are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,15 +114,18 @@ def explained_variance(look: Look, grey: FloatArray) -> FloatArray:
     return np.clip(1.0 - (residual**2).sum(axis=1) / np.maximum(total, 1e-9), 0.0, 1.0) * (total > 0)
 
 
-def is_brighter(look: Look, grey: FloatArray, settings: DetectionSettings) -> BoolArray:
-    """Say which poses (K,) find light where their facets should show it, and dark ground around.
+def faces_are_bright(look: Look, grey: FloatArray, settings: DetectionSettings) -> BoolArray:
+    """Say for which poses (K,) the facets that face the viewer are brighter than the ground around the part.
 
-    The correlation of the expected brightness with the grey values is above 0. It is far below on the dark walls of a
-    bin, which have a part's width and straight edges.
+    They mirror the lights above the bin. On the dark walls of a bin, which have a part's width and straight edges, they
+    are not; where a pose shows hardly any such facet it says nothing, and passes.
     """
-    cosine = np.where(look.covered, -look.normals[..., 2], -1.0)
-    expected = brightness(cosine, settings)
-    return ((expected - expected.mean(axis=1, keepdims=True)) * grey).sum(axis=1) > 0
+    facing = look.covered & (-look.normals[..., 2] >= settings.bright_cosine)
+    ground = ~look.covered
+    share = facing.sum(axis=1) / np.maximum(look.covered.sum(axis=1), 1)
+    bright = (grey * facing).sum(axis=1) / np.maximum(facing.sum(axis=1), 1)
+    dark = (grey * ground).sum(axis=1) / np.maximum(ground.sum(axis=1), 1)
+    return (bright > dark) | (share < LEAST_FACING)
 
 
 def _cubic(normals: FloatArray) -> FloatArray:

@@ -65,8 +65,8 @@ class DetectionSettings(BaseModel):
     """An object whose silhouette is covered further than this by a better object's is a false alarm."""
     min_score: Annotated[FiniteFloat, Field(ge=0, le=100)] = 40.0
     """Score the best hypothesis of an object needs: the mean of contour agreement and explained variance, percent."""
-    brighter_than_ground: bool = True
-    """Whether facets that face the viewer are brighter than what the part lies on; off for black parts."""
+    bright_faces: bool = True
+    """Whether facets that face the viewer mirror light and are brighter than the ground; off for black parts."""
     depth_tolerance: Annotated[FiniteFloat, Field(gt=0, le=10)] = 0.15
     """How far a measured depth may differ from a hypothesis before it speaks against it, in diameters of the part."""
     temperature: Annotated[FiniteFloat, Field(gt=0)] = 4.0

@@ -29,8 +29,8 @@ PYRAMID = (4, 8)
 LARGEST_UPSCALING = 2.0
 MARGIN_PX = 12
 """Free border of a template picture: the blur, the Sobel and the coarse level must not see its edge."""
-REFUSED_SHARE = 0.05
-"""Share of refused templates above which fewer features are asked for."""
+REFUSED_SHARES = (0.05, 0.2, 0.5)
+"""Shares of the views that may offer too few features for a template, tried in turn: sheets have poor views."""
 FEWER_FEATURES = (48, 32, 24, 16)
 
 
@@ -213,16 +213,19 @@ class _Studio:
 
 
 def _features_that_fit(studio: _Studio, settings: DetectionSettings) -> int:
-    """Return the most features that the smallest pictures offer in all but ``REFUSED_SHARE`` of the views."""
+    """Return the most features that the smallest pictures offer in all but ``REFUSED_SHARES`` of the views."""
     far_m = float(distances(settings)[-1])
     pictures = [studio.picture(direction, far_m)[0] for direction in view_directions(settings.view_step_deg)]
+    refused: dict[int, float] = {}
     for count in (settings.num_features, *(n for n in FEWER_FEATURES if n < settings.num_features)):
         detector = new_detector(settings, count)
-        refused = sum(_add(detector, picture, "probe")[0] < 0 for picture in pictures)
-        if refused <= REFUSED_SHARE * len(pictures):
-            return count
+        refused[count] = sum(_add(detector, picture, "probe")[0] < 0 for picture in pictures) / len(pictures)
+    for share in REFUSED_SHARES:
+        fitting = [count for count in refused if refused[count] <= share]
+        if fitting:
+            return max(fitting)
     raise DetectionError(
-        f"{studio.part.name}: over {REFUSED_SHARE:.0%} of the views offer fewer than {FEWER_FEATURES[-1]} features at "
+        f"{studio.part.name}: over {REFUSED_SHARES[-1]:.0%} of the views offer fewer than {min(refused)} features at "
         f"{far_m:.3g} m; raise span_px ({settings.span_px:g}) or lower strong_threshold ({settings.strong_threshold:g})"
     )
 

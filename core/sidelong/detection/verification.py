@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sidelong.detection.appearance import AppearanceModel, Look, explained_variance, grey_around, is_brighter, smoothed
+from sidelong.detection.appearance import (
+    AppearanceModel,
+    Look,
+    explained_variance,
+    faces_are_bright,
+    grey_around,
+    smoothed,
+)
 from sidelong.detection.contours import FINE_SPANS, ContourModel, EdgeField
 from sidelong.detection.depth_evidence import contradicted, offsets, residuals
 from sidelong.detection.settings import DetectionSettings
@@ -103,8 +110,8 @@ class Verifier:
         grey = grey_around(look, evidence.smooth)
         agreement = self._contours.agreement(evidence.edges, self._camera, poses)
         appearance = explained_variance(look, grey)
-        if self._settings.brighter_than_ground:
-            appearance *= is_brighter(look, grey, self._settings)
+        if self._settings.bright_faces:
+            appearance *= faces_are_bright(look, grey, self._settings)
         scores = 50 * (agreement + appearance) * (1.0 - doubt)
         silhouettes = tuple(uv[covered] for uv, covered in zip(look.uv, look.covered, strict=True))
         return Verified(poses, scores, silhouettes)
