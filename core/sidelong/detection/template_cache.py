@@ -23,6 +23,7 @@ FORMAT = 1
 TRAINING_SETTINGS = {
     "view_step_deg", "roll_step_deg", "distance_m", "distance_ratio", "span_px", "num_features",
     "weak_threshold", "strong_threshold", "dark_cosine", "bright_cosine", "dark_level",
+    "ground_level",
 }  # fmt: skip
 ARRAYS = ("class_index", "template_id", "axis_R_object", "distance_m", "centre_px")
 

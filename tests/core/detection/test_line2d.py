@@ -184,7 +184,7 @@ def test_the_key_changes_with_part_camera_and_training_but_not_with_matching():
 
 def test_a_part_too_small_for_templates_is_refused(tmp_path: Path):
     camera = PinholeCamera(320, 256, 40.0, 40.0, 159.5, 127.5)
-    with pytest.raises(DetectionError, match="bracket: over 5% of the views offer fewer than 16 features"):
+    with pytest.raises(DetectionError, match="bracket: over 50% of the views offer fewer than 16 features"):
         load_or_train(bracket(), camera, TINY, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
