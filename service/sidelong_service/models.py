@@ -73,10 +73,14 @@ class _Answer(BaseModel):
 
 
 class Candidate(_Answer):
-    """What the planner expects of a view, and why it could not be taken, if it could not."""
+    """What the planner expects of a view, and why it could not be taken, if it could not.
+
+    ``gain_share`` is the gain over the pixels still missing: what a threshold can be compared with on any image size.
+    """
 
     view: str
     gain_px: float
+    gain_share: float
     lost_px: dict[str, float]
     dropped: str | None
 
@@ -109,7 +113,13 @@ class ViewReport(_Answer):
             completeness=step.completeness,
             stage_s=dict(step.stage_s),
             candidates=tuple(
-                Candidate(view=s.view.name, gain_px=s.gain_px, lost_px=dict(s.lost_px), dropped=s.dropped)
+                Candidate(
+                    view=s.view.name,
+                    gain_px=s.gain_px,
+                    gain_share=s.gain_px / max(1, step.missing_px - step.recovered_px),
+                    lost_px=dict(s.lost_px),
+                    dropped=s.dropped,
+                )
                 for s in step.scores
             ),
         )

@@ -44,6 +44,8 @@ def test_each_view_tells_its_gains_its_times_and_why_others_were_not_taken(ended
         assert after["measured_gain_px"] == after["recovered_px"] - before["recovered_px"]
         taken = max(before["candidates"], key=lambda candidate: candidate["gain_px"])
         assert (after["view"], after["predicted_gain_px"]) == (taken["view"], taken["gain_px"])
+        still_missing_px = before["missing_px"] - before["recovered_px"]
+        assert taken["gain_share"] == pytest.approx(taken["gain_px"] / still_missing_px)
         dropped = {c["view"]: c["dropped"] for c in before["candidates"] if c["dropped"]}
         assert dropped[before["view"]] == "already taken"
         assert {"move", "capture", "fuse"} <= after["stage_s"].keys()
