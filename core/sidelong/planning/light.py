@@ -13,6 +13,10 @@ from sidelong.physics.response import Response
 DEFAULT_INTENSITY = 300.0
 """Of a projector nobody has measured, at 1 m, in saturation exposures per second."""
 
+BLACK_PLASTIC = Phong(k_d=0.01, k_s=0.04, n=8.0)
+"""Not fitted: a dielectric mirrors 4 % (Fresnel, refractive index 1.5), and one that is black scatters next to nothing.
+Beside metal it gives no depth, whatever the exact numbers."""
+
 Share = Annotated[FiniteFloat, Field(ge=0)]
 
 
@@ -42,7 +46,8 @@ class LightSettings(BaseModel):
         default="all", description="what may hide a point from cameras and projector: nothing, its own part, all parts"
     )
     materials: dict[str, MaterialSettings] = Field(
-        default_factory=dict[str, MaterialSettings], description="by name; the paper's three are known"
+        default_factory=dict[str, MaterialSettings],
+        description="by name; the paper's three and black_plastic are known",
     )
     stand_in: str | None = Field(
         default="stainless", description="material taken for one whose reflectance is not known; none: refuse the part"
@@ -76,4 +81,5 @@ class LightSettings(BaseModel):
         return tuple(name for name in names if name not in self._known())
 
     def _known(self) -> dict[str, Phong]:
-        return PAPER_MATERIALS | {name: Phong(m.k_d, m.k_s, m.n) for name, m in self.materials.items()}
+        known = PAPER_MATERIALS | {"black_plastic": BLACK_PLASTIC}
+        return known | {name: Phong(m.k_d, m.k_s, m.n) for name, m in self.materials.items()}

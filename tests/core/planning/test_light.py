@@ -31,7 +31,7 @@ def test_an_unknown_material_is_taken_for_the_stand_in_and_named():
 
 @pytest.mark.parametrize("stand_in", [None, "unobtainium"])
 def test_without_a_stand_in_an_unknown_material_is_refused(stand_in: str | None):
-    with pytest.raises(SettingsError, match=r"'bronze'.*known are matte, plated, stainless"):
+    with pytest.raises(SettingsError, match=r"'bronze'.*known are black_plastic, matte, plated, stainless"):
         LightSettings(stand_in=stand_in).reflectances(("bronze",))
 
 
