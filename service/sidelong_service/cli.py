@@ -177,7 +177,8 @@ def _compare(comparison: Comparison, json_file: Path | None, plot: Path) -> None
     if json_file is not None:
         write_whole(json_file, json.dumps([row.model_dump(mode="json") for row in rows], indent=1).encode())
     if not rows:
-        raise CommandError(f"{comparison.dataset.root}: no reference view could be compared")
+        why = "interrupted before the first row" if interrupted else "no reference view could be compared"
+        raise CommandError(f"{comparison.dataset.root}: {why}")
     points = summarise(rows)
     out.print(comparison_table(points))
     write_whole(plot, draw(points, f"{', '.join(dict.fromkeys(row.object for row in rows))}: {len(rows)} rows"))

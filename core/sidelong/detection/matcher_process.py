@@ -97,10 +97,11 @@ class MatcherProcess:
             "classes": list(self._templates.classes),
         }
         descriptor = theirs.fileno()
+        # in a session of its own: Ctrl-C is for us, and the child ends when our end of the pipe does
         self._child = subprocess.Popen(
             [sys.executable, "-m", "sidelong.detection.matcher_child", str(descriptor),
              str(self._templates.folder), json.dumps(options)],
-            pass_fds=[descriptor], stdin=subprocess.DEVNULL,
+            pass_fds=[descriptor], stdin=subprocess.DEVNULL, start_new_session=True,
         )  # fmt: skip
         theirs.close()
         self._channel = ours
