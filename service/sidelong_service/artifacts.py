@@ -36,8 +36,6 @@ class Record:
         Intrinsics of the reference view.
     setup
         What the scan runs with.
-    recipe
-        The effective settings, as JSON.
     image
         Reference image with the projector off.
     views
@@ -48,7 +46,6 @@ class Record:
 
     camera: PinholeCamera
     setup: Setup
-    recipe: dict[str, Any]
     image: GrayImage | None = None
     views: list[ViewReport] = field(default_factory=list[ViewReport])
     first: Step | None = None
@@ -132,9 +129,9 @@ def _report(step: Step, record: Record) -> bytes:
         "completeness": step.completeness,
         "missing_px": step.missing_px,
         "recovered_px": step.recovered_px,
-        "setup": record.setup.model_dump(mode="json"),
+        "setup": record.setup.model_dump(mode="json", exclude={"recipe"}),
         "views": [view.model_dump(mode="json") for view in record.views],
-        "recipe": record.recipe,
+        "recipe": record.setup.recipe,
         "K": _intrinsics(record.camera).tolist(),
         "base_T_camera": _reference(record).view.base_T_camera.tolist(),
         "depth_png": {

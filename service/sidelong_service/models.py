@@ -126,7 +126,7 @@ class ViewReport(_Answer):
 
 
 class Setup(_Answer):
-    """What a scan runs with."""
+    """What a scan runs with; ``recipe`` holds the settings in effect, those filled in from the cell or the data too."""
 
     part: str
     camera: str
@@ -135,6 +135,7 @@ class Setup(_Answer):
     height_px: int
     candidates: int
     left_out: tuple[str, ...]
+    recipe: dict[str, Any]
 
 
 class Artifact(_Answer):
@@ -163,7 +164,8 @@ class ScanSummary(_Answer):
 class Scan(ScanSummary):
     """A scan with all it knows.
 
-    ``views`` are in the order taken, the reference view first; ``problem`` says why a scan failed.
+    ``views`` are in the order taken, the reference view first; ``problem`` says why a scan failed; ``recipe`` is as it
+    was asked for.
     """
 
     problem: Problem | None

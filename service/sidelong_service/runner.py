@@ -78,7 +78,7 @@ class ScanRun:
         """
         camera = WatchedCamera(self.cell.camera)
         with build_stages(self.recipe, self.part, camera.rig, self.cache_dir, progress=self._progress) as stages:
-            record = Record(camera.rig.left, self._setup(stages), self.recipe.model_dump(mode="json"))
+            record = Record(camera.rig.left, self._setup(stages))
             self.listener.note("setup", record.setup.model_dump())
             try:
                 self._take_views(replace(self.cell, camera=camera), stages, record)
@@ -114,6 +114,7 @@ class ScanRun:
             height_px=stages.rig.left.height,
             candidates=len(self.cell.candidates),
             left_out=stages.left_out,
+            recipe=self.recipe.model_dump(mode="json"),
         )
 
 

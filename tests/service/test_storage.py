@@ -30,6 +30,7 @@ VIEW: dict[str, Any] = {
 }  # fmt: skip
 SETUP: dict[str, Any] = {
     "part": "tube_fitting", "camera": "c", "arm": "a", "width_px": 4, "height_px": 3, "candidates": 2, "left_out": [],
+    "recipe": {"planning": {}},
 }  # fmt: skip
 
 

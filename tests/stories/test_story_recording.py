@@ -132,6 +132,7 @@ def test_the_light_fitted_to_the_white_capture_stands_in_the_report(
     assert report["recipe"]["light"]["intensity"] == pytest.approx(fit.intensity)
     assert fit.intensity != DEFAULT_INTENSITY
     assert report["recipe"] | {"light": None} == ended["recipe"] | {"light": None}
+    assert report["recipe"] == ended["setup"]["recipe"]
 
 
 def test_an_intensity_that_is_given_is_not_fitted(service: ServiceProcess) -> None:

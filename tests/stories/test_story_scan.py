@@ -109,7 +109,7 @@ def test_what_the_reference_view_measured_is_in_the_result_to_the_bit(
 def test_report_says_what_the_scan_says(service: ServiceProcess, ended: dict[str, Any]) -> None:
     report = json.loads(read(service, ended, "report.json"))
     assert report["views"] == ended["views"]
-    assert report["recipe"] == ended["recipe"]
+    assert report["recipe"] == ended["setup"]["recipe"]
     assert report["finish_reason"] == ended["finish_reason"]
     assert report["depth_png"]["beyond_largest_px"] == 0
 
