@@ -22,8 +22,9 @@ from sidelong_service.models import EventKind, RecordedScene, ScanRequest, ScanS
 from sidelong_service.problems import validation_problem
 
 if TYPE_CHECKING:  # open3d and what needs it wait for the commands that use them
+    from sidelong.evaluation.cases import Case
     from sidelong.evaluation.compare import Row, Run
-    from sidelong_service.comparison import Case, Comparison
+    from sidelong_service.comparison import Comparison
 
 app = typer.Typer(
     help="Next-best-view depth completion for shiny parts.",
@@ -130,8 +131,9 @@ def compare(
     plot: Annotated[Path, typer.Option(help="File for the plot, PNG.")] = Path("sidelong-comparison.png"),
 ) -> None:
     """Compare strategies on recorded scenes: completeness after each view, and against seconds."""
+    from sidelong.evaluation.cases import cases_of
     from sidelong.evaluation.dataset import Dataset
-    from sidelong_service.comparison import Comparison, cases_of
+    from sidelong_service.comparison import Comparison
     from sidelong_service.settings import load_settings
 
     with plain_errors():
@@ -151,13 +153,12 @@ def compare(
 
 
 def _compare(comparison: Comparison, json_file: Path | None, plot: Path) -> None:
-    """Run a comparison and show it; Ctrl-C keeps what there is."""
-    from sidelong.evaluation.tradeoff import draw, summarise
+    """Run a comparison and show it; Ctrl-C and a scene that cannot be used keep what there is."""
     from sidelong_service.artifacts import write_whole
 
     rows: list[Row] = []
     total = len(comparison.cases) * len(comparison.runs) * comparison.recipe.planning.max_views
-    interrupted = False
+    ended_by: KeyboardInterrupt | SidelongError | None = None
     with CountedProgress(err) as progress:
 
         def skip(case: Case, why: str) -> None:
@@ -172,20 +173,30 @@ def _compare(comparison: Comparison, json_file: Path | None, plot: Path) -> None
             for row in comparison.rows(skip, train):
                 rows.append(row)
                 progress.show(f"{row.object} scene {row.scene}", len(rows), total)
-        except KeyboardInterrupt:
-            interrupted = True
+        except (KeyboardInterrupt, SidelongError) as error:
+            ended_by = error
     if json_file is not None:
         write_whole(json_file, json.dumps([row.model_dump(mode="json") for row in rows], indent=1).encode())
+    if rows:
+        _show_comparison(rows, plot)
+    if json_file is not None:
+        out.print(f"  {json_file}", highlight=False, markup=False, soft_wrap=True)
+    if isinstance(ended_by, SidelongError):
+        raise ended_by
+    if ended_by is not None:
+        raise typer.Exit(130)
     if not rows:
-        why = "interrupted before the first row" if interrupted else "no reference view could be compared"
-        raise CommandError(f"{comparison.dataset.root}: {why}")
+        raise CommandError(f"{comparison.dataset.root}: no reference view could be compared")
+
+
+def _show_comparison(rows: list[Row], plot: Path) -> None:
+    from sidelong.evaluation.tradeoff import draw, summarise
+    from sidelong_service.artifacts import write_whole
+
     points = summarise(rows)
     out.print(comparison_table(points))
     write_whole(plot, draw(points, f"{', '.join(dict.fromkeys(row.object for row in rows))}: {len(rows)} rows"))
-    for file in (plot, *([json_file] if json_file is not None else [])):
-        out.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
-    if interrupted:
-        raise typer.Exit(130)
+    out.print(f"  {plot}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _runs(strategies: str, seeds: int) -> tuple[Run, ...]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pydantic import BaseModel, ConfigDict
 
 from sidelong.devices import CaptureRequest, Cell
+from sidelong.evaluation.cases import Case
 from sidelong.evaluation.metrics import Truth
 from sidelong.planning.selection import StrategyName, strategy_of
 from sidelong.recipe import GivenObjects, Recipe, Stages
@@ -61,17 +62,8 @@ class Run:
     seed: int = 0
 
 
-@dataclass(frozen=True)
-class Label:
-    """Where rows come from."""
-
-    object: str
-    scene: int
-    reference: str
-
-
 def compare_reference(
-    label: Label,
+    case: Case,
     cell: Cell,
     stages: Stages,
     recipe: Recipe,
@@ -97,7 +89,7 @@ def compare_reference(
         )
         mine = replace(stages, detector=GivenObjects(objects), strategy=strategy_of(run.strategy, run.seed))
         steps = scan(cell, mine, recipe.model_copy(update={"planning": planning}), Stopwatch())
-        yield from _rows(label, run, truth, _charged(steps, detect_s), (planning.max_views, time))
+        yield from _rows(case, run, truth, _charged(steps, detect_s), (planning.max_views, time))
 
 
 def _charged(steps: Iterator[Step], detect_s: float) -> Iterator[Step]:
@@ -106,7 +98,7 @@ def _charged(steps: Iterator[Step], detect_s: float) -> Iterator[Step]:
         yield replace(step, stage_s={**step.stage_s, "detect": detect_s}) if step.index == 0 else step
 
 
-def _rows(label: Label, run: Run, truth: Truth, steps: Iterator[Step], limits: tuple[int, CellTime]) -> Iterator[Row]:
+def _rows(case: Case, run: Run, truth: Truth, steps: Iterator[Step], limits: tuple[int, CellTime]) -> Iterator[Row]:
     """Turn the steps of a run into rows; a run that ended early keeps its last completeness."""
     max_views, time = limits
     spent_s, row = Counter[str](), None
@@ -116,9 +108,9 @@ def _rows(label: Label, run: Run, truth: Truth, steps: Iterator[Step], limits: t
         compute_s = sum(stage_s[stage] for stage in COMPUTING)
         spent_s += Counter(step.stage_s)
         row = Row(
-            object=label.object,
-            scene=label.scene,
-            reference=label.reference,
+            object=case.object,
+            scene=case.scene,
+            reference=case.reference,
             strategy=run.strategy,
             seed=run.seed,
             views_added=step.index,
