@@ -31,6 +31,7 @@ def operations(document: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]
 def test_the_api_process_loads_neither_open3d_nor_drivers_nor_vendor_code() -> None:
     program = """
 import json, sys
+import sidelong_service.cli
 import sidelong_service.server
 from sidelong_service.app import create_app
 from sidelong_service.settings import load_settings
