@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Protocol, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from sidelong.detection.settings import DetectionSettings
+from sidelong.fusion.settings import FusionSettings
 from sidelong.physics.sensing import SensingSettings
 from sidelong.planning.light import DEFAULT_INTENSITY, LightSettings
 from sidelong.planning.selection import Strategy, StrategyName, strategy_of
@@ -48,6 +49,7 @@ class Recipe(BaseModel):
     planning: PlanningSettings = PlanningSettings()
     light: LightSettings = LightSettings()
     sensing: SensingSettings = SensingSettings()
+    fusion: FusionSettings = FusionSettings()
     image_exposure_s: ExposureS = Field(default=0.2, description="of the image that detection reads, projector off")
     depth_exposure_s: ExposureS = Field(default=0.012, description="of the depth captures")
     move_deadline_s: Annotated[FiniteFloat, Field(gt=0, le=600, description="for one move")] = 30.0

@@ -51,7 +51,7 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
     view = _move(cell, cell.reference, recipe, stopwatch)
     image = _capture(cell, view, CaptureRequest(Projector.OFF, recipe.image_exposure_s), stopwatch)
     frame = _capture(cell, view, depth_request, stopwatch)
-    completion = Completion(frame, stages.rig.left)
+    completion = Completion(frame, stages.rig.left, recipe.fusion)
     missing_at_first = completion.missing.copy()
 
     # 1: Line2D, I_o -> {q}
