@@ -76,7 +76,7 @@ def test_children_end_when_the_service_is_killed_and_a_restart_marks_the_scan(tm
     service.close()
 
 
-def test_sigterm_stops_the_arm_and_ends_with_open_streams_within_two_seconds(tmp_path: Path) -> None:
+def test_sigterm_stops_the_arm_and_ends_with_open_streams_within_seconds(tmp_path: Path) -> None:
     service = ServiceProcess(tmp_path, small_cell(arm_speed_factor=0.5))
     scan_id = start(service)
     service.wait_for(scan_id, "phase", phase="move")
@@ -96,7 +96,7 @@ def test_sigterm_stops_the_arm_and_ends_with_open_streams_within_two_seconds(tmp
     took_s = service.terminate()
     for listener in listeners:
         listener.join()
-    assert took_s < 2.0
+    assert took_s < 5.0
     assert all(wait_until_gone(child, 1.0) for child in children)
     service.close()
 
