@@ -68,14 +68,16 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
             missing_at_first,
             recipe.planning.stride_px,
         )
+        completion.expect(belief.surface_m)
         light = replace(stages.light, exposure_s=frame.exposure_s)
         planner = Planner(belief, stages.part, stages.rig, light)
 
     taken = [view]
     step = Step(
         index=0, view=view, frame=frame, objects=objects, depth_m=completion.depth_m.copy(),
-        source=completion.source.copy(), missing_px=int(belief.target.sum()), recovered_px=0, predicted_gain_px=0.0,
-        measured_gain_px=0.0, scores=(), stage_s={}, stop=None, left_out=stages.left_out,
+        source=completion.source.copy(), doubtful=completion.doubtful, missing_px=int(belief.target.sum()),
+        recovered_px=0, predicted_gain_px=0.0, measured_gain_px=0.0, scores=(), stage_s={}, stop=None,
+        left_out=stages.left_out,
     )  # fmt: skip
     while True:
         # 3: G_i of each candidate, equation (13), unless the scan ends here anyway
@@ -100,11 +102,12 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
         frame = _capture(cell, view, depth_request, stopwatch)
         with stopwatch.stage("fuse"):
             completion.add(frame)
-        recovered_px = int((belief.target & ~completion.missing).sum())
+        doubtful = completion.doubtful
+        recovered_px = int((belief.target & ~completion.missing & ~doubtful).sum())
         step = replace(
             step, index=step.index + 1, view=view, frame=frame, depth_m=completion.depth_m.copy(),
-            source=completion.source.copy(), recovered_px=recovered_px, predicted_gain_px=best.gain_px,
-            measured_gain_px=float(recovered_px - step.recovered_px), scores=(),
+            source=completion.source.copy(), doubtful=doubtful, recovered_px=recovered_px,
+            predicted_gain_px=best.gain_px, measured_gain_px=float(recovered_px - step.recovered_px), scores=(),
         )  # fmt: skip
 
 

@@ -165,10 +165,12 @@ class Step:
         (H, W) completed depth of the reference view, NaN where missing.
     source
         (H, W) index of the step that measured each pixel, -1 where missing.
+    doubtful
+        (H, W) completed pixels whose depth lies well behind the part believed there: ground seen past it.
     missing_px
         Pixels on the detected objects that had no depth in the reference view.
     recovered_px
-        How many of those have depth now.
+        How many of those have depth now that is not doubtful.
     predicted_gain_px, measured_gain_px
         Gain of this view: G of equation (13) beforehand, newly completed target pixels afterwards; 0 at the reference.
     scores
@@ -187,6 +189,7 @@ class Step:
     objects: tuple[DetectedObject, ...]
     depth_m: FloatArray
     source: IntArray
+    doubtful: BoolArray
     missing_px: int
     recovered_px: int
     predicted_gain_px: float

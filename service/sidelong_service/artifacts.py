@@ -73,7 +73,7 @@ def write_results(folder: Path, record: Record, draw: Callable[[Record], bytes])
     if step is None:
         return []
     contents = {
-        "depth.png": depth_png(step.depth_m),
+        "depth.png": depth_png(_trusted_m(step)),
         "depth.npz": _depth_npz(step, record),
         "cloud.ply": _cloud(step, record),
         "picture.png": draw(record),
@@ -103,8 +103,13 @@ def ply(points_m: FloatArray, gray: GrayImage) -> bytes:
     return ("\n".join(header) + "\n").encode() + vertices.tobytes()
 
 
+def _trusted_m(step: Step) -> FloatArray:
+    """Return the completed depth without what is doubtful: a picture and a cloud have no room for the mark."""
+    return np.where(step.doubtful, np.nan, step.depth_m)
+
+
 def _cloud(step: Step, record: Record) -> bytes:
-    measured = np.isfinite(step.depth_m)
+    measured = np.isfinite(_trusted_m(step))
     points_camera = record.camera.pixel_rays()[measured] * step.depth_m[measured][:, None]
     image = record.image if record.image is not None else step.frame.left
     return ply(transform_points(_reference(record).view.base_T_camera, points_camera), image[measured])
@@ -115,6 +120,7 @@ def _depth_npz(step: Step, record: Record) -> bytes:
         {
             "depth_m": step.depth_m,
             "source": step.source.astype(np.int16),
+            "doubtful": step.doubtful,
             "K": _intrinsics(record.camera),
             "base_T_camera": _reference(record).view.base_T_camera,
             "views": np.array([view.view for view in record.views]),
@@ -129,6 +135,7 @@ def _report(step: Step, record: Record) -> bytes:
         "completeness": step.completeness,
         "missing_px": step.missing_px,
         "recovered_px": step.recovered_px,
+        "doubtful_px": int(step.doubtful.sum()),
         "setup": record.setup.model_dump(mode="json", exclude={"recipe"}),
         "views": [view.model_dump(mode="json") for view in record.views],
         "recipe": record.setup.recipe,

@@ -73,7 +73,7 @@ def test_png_and_npz_hold_the_same_depth(service: ServiceProcess, ended: dict[st
     depth_m = arrays["depth_m"]
     assert picture.dtype == np.uint16
     assert picture.shape == depth_m.shape == (256, 320)
-    assert np.array_equal(picture == 0, np.isnan(depth_m))
+    assert np.array_equal(picture == 0, np.isnan(depth_m) | arrays["doubtful"])
     unit_m = report["depth_png"]["unit_m"]
     np.testing.assert_allclose((picture * unit_m)[picture > 0], depth_m[picture > 0], atol=unit_m / 2 * 1.001)
     assert np.array_equal(arrays["source"] < 0, np.isnan(depth_m))
@@ -84,7 +84,7 @@ def test_cloud_lies_where_depth_and_pose_say(service: ServiceProcess, ended: dic
     arrays = np.load(io.BytesIO(read(service, ended, "depth.npz")))
     header, _, body = read(service, ended, "cloud.ply").partition(b"end_header\n")
     vertices = np.frombuffer(body, dtype=[("point", "<f4", 3), ("colour", "u1", 3)])
-    rows, columns = np.nonzero(np.isfinite(arrays["depth_m"]))
+    rows, columns = np.nonzero(np.isfinite(arrays["depth_m"]) & ~arrays["doubtful"])
     assert f"element vertex {len(rows)}\n".encode() in header
     assert len(vertices) == len(rows)
     # back through the inverse pose and the intrinsics, each point lands on its own pixel, at its own depth

@@ -71,6 +71,7 @@ class Completion:
             raise DepthError(f"view {reference.view.name}: the depth map has 0 of {present.size} px measured")
         self._holes = ~present
         """(H, W) what the reference did not measure; holes are numbered row by row."""
+        self._farthest_m: FloatArray = np.full(int(self._holes.sum()), np.inf)
         self._layers: list[_Layer] = []
         self.depth_m: FloatArray
         self.source: IntArray
@@ -80,6 +81,23 @@ class Completion:
     def missing(self) -> BoolArray:
         """(H, W) pixels that no view has measured yet."""
         return self.source == MISSING
+
+    def expect(self, surface_m: FloatArray) -> None:
+        """Say what surface is believed to be at the pixels, (H, W), NaN where nothing is known; see ``doubtful``."""
+        expected_m = surface_m[self._holes]
+        self._farthest_m = np.where(np.isnan(expected_m), np.inf, expected_m + self._settings.behind_m)
+
+    @property
+    def doubtful(self) -> BoolArray:
+        """(H, W) completed pixels whose depth lies more than ``behind_m`` behind the surface believed there.
+
+        Where no view has measured a part yet, another view may look past it and measure the ground, which then lands in
+        the part's pixels. A nearer depth of a later view takes its place.
+        """
+        doubtful = np.zeros_like(self._holes)
+        with np.errstate(invalid="ignore"):
+            doubtful[self._holes] = self.depth_m[self._holes] > self._farthest_m
+        return doubtful
 
     def add(self, frame: Frame) -> int:
         """Lay the depth map of a further view into the reference view.

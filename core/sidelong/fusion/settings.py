@@ -22,6 +22,10 @@ class FusionSettings(BaseModel):
     front_band_m: Annotated[
         FiniteFloat, Field(ge=0, le=0.05, description="depths this far behind the nearest one are averaged with it")
     ] = 2e-3
+    behind_m: Annotated[
+        FiniteFloat,
+        Field(ge=0, le=10, description="depths further behind the believed surface of a part are doubtful"),
+    ] = 8e-3
     max_incidence_rad: Annotated[
         FiniteFloat, Field(gt=0, lt=1.57, description="neighbours that rise more steeply are taken for a depth edge")
     ] = 1.3

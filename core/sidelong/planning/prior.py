@@ -27,12 +27,15 @@ class Belief:
         One for each hypothesis that matters.
     target
         (H, W) pixels on the most probable hypotheses that had no depth: what the scan is to complete.
+    surface_m
+        (H, W) depth of the most probable hypotheses, NaN where none is.
     base_T_objects
         Most probable pose of each object.
     """
 
     priors: tuple[Prior, ...]
     target: BoolArray
+    surface_m: FloatArray
     base_T_objects: tuple[FloatArray, ...]
 
 
@@ -73,7 +76,7 @@ def believe(
             base_T_object = base_T_camera @ hypothesis.camera_T_object
             prior = _prior_of(part, part_alone, (camera, base_T_camera, base_T_object), missing & grid, (front, index))
             priors.append(Prior(index, hypothesis.probability, float(stride_px**2), *prior, base_T_object))
-    return Belief(tuple(priors), target, base_T_objects)
+    return Belief(tuple(priors), target, front.depth_m, base_T_objects)
 
 
 def _prior_of(

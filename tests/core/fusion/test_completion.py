@@ -208,3 +208,30 @@ def test_poses_that_are_no_motion_are_refused(truth: FloatArray) -> None:
 def test_settings_out_of_range_are_refused(field: str, value: float) -> None:
     with pytest.raises(ValidationError, match=field):
         FusionSettings.model_validate({field: value})
+
+
+def test_ground_seen_past_an_unmeasured_part_is_doubtful_until_the_part_is_seen(
+    truth: FloatArray, others: list[FloatArray]
+) -> None:
+    """The parts are missing in the reference and in the first other view, as if they mirrored all light away."""
+    floor_z_m = 0.7
+    part = truth < floor_z_m - 0.01
+    completion = Completion(frame_of(np.where(part, np.nan, truth), REFERENCE), CAMERA)
+    floor_only = floor_depth_m(OTHERS[0])
+    completion.add(frame_of(np.where(np.abs(others[0] - floor_only) < 1e-3, others[0], np.nan), OTHERS[0]))
+    assert not completion.doubtful.any()  # nothing is believed yet
+    completion.expect(np.where(part, truth, np.nan))
+    filled = part & np.isfinite(completion.depth_m)
+    assert filled.sum() > 100
+    wrong = filled & (completion.depth_m - truth > 0.008)
+    assert np.array_equal(completion.doubtful, wrong)
+    assert wrong.sum() > 0.5 * filled.sum()
+    for depth_m, pose in zip(others[1:], OTHERS[1:], strict=True):
+        completion.add(frame_of(depth_m, pose))
+    assert completion.doubtful.sum() < 0.2 * wrong.sum()
+
+
+def floor_depth_m(base_T_camera: FloatArray) -> FloatArray:
+    """Depth of the plane z = 0 in the base frame, seen from a pose."""
+    rays = CAMERA.pixel_rays() @ base_T_camera[:3, :3].T
+    return -base_T_camera[2, 3] / rays[..., 2]
