@@ -84,7 +84,7 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
         stop, best = _spent(step, recipe.planning), None
         if stop is None:
             with stopwatch.stage("score"):
-                step = replace(step, scores=_score(cell, stages, planner, taken, completion.missing))
+                step = replace(step, scores=_score(cell, stages, planner, taken, completion.missing | step.doubtful))
             best = best_of(step.scores)
             stop = _not_worth_it(step, best, recipe.planning)
 

@@ -130,7 +130,7 @@ def test_a_wall_between_projector_and_plate_casts_a_shadow_the_cameras_do_not_sh
     middle = at(*(0.5 * projector))
     small = box((0.012, 0.012, 0.012))
     belief = believe(detected(at(0.0), middle), small, CAMERA, TOP.base_T_camera, EVERYWHERE)
-    lower = Belief(belief.priors[:1], belief.target, belief.base_T_objects)
+    lower = Belief(belief.priors[:1], belief.target, belief.surface_m, belief.base_T_objects)
     shadowed = Planner(lower, small, rig(), light()).score(TOP, EVERYWHERE)
     assert shadowed.gain_px == pytest.approx(0.0, abs=1.5)
     assert shadowed.lost_px["shadow"] > 3
