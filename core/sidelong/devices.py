@@ -42,6 +42,11 @@ class Camera(Protocol):
         ...
 
     @property
+    def serial(self) -> str:
+        """Serial number, by which calibrations name the device they are of; valid between open and close."""
+        ...
+
+    @property
     def rig(self) -> StereoRig:
         """Intrinsics, baseline and projector; valid between open and close."""
         ...

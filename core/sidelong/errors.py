@@ -10,7 +10,8 @@
     │   ├── ImageError           an image is missing, truncated or of the wrong size
     │   ├── DepthError           a depth map carries no measurement
     │   ├── PoseError            a transform is not a rigid motion
-    │   └── MeshError            a CAD model is empty, open or in the wrong unit
+    │   ├── MeshError            a CAD model is empty, open or in the wrong unit
+    │   └── CalibrationError     captures cannot carry a calibration, or a calibration does not fit the device
     ├── DetectionError           the matcher could not answer
     │   └── MatcherDiedError     its child process died or missed its deadline
     └── DeviceError              a camera or an arm failed; ``device`` names it
@@ -61,6 +62,10 @@ class PoseError(InputError):
 
 class MeshError(InputError):
     """A CAD model is empty, open or in the wrong unit."""
+
+
+class CalibrationError(InputError):
+    """Captures cannot carry the calibration that is asked of them, or a calibration does not fit the device."""
 
 
 class DetectionError(SidelongError):

@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # the service reads recipes without open3d
     from sidelong.planning.gain import LightModel
 
 ExposureS = Annotated[FiniteFloat, Field(ge=1e-6, le=10)]
+CalibrationId = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,63}$")]
 
 
 class PlanningSettings(BaseModel):
@@ -53,6 +54,9 @@ class Recipe(BaseModel):
     image_exposure_s: ExposureS = Field(default=0.2, description="of the image that detection reads, projector off")
     depth_exposure_s: ExposureS = Field(default=0.012, description="of the depth captures")
     move_deadline_s: Annotated[FiniteFloat, Field(gt=0, le=600, description="for one move")] = 30.0
+    calibrations: tuple[CalibrationId, ...] = Field(
+        default=(), max_length=32, strict=False, description="ids of those that go before what the settings say"
+    )
 
 
 class Detector(Protocol):
@@ -164,6 +168,7 @@ def light_model(recipe: Recipe, part: Part) -> LightModel:
         exposure_s=recipe.depth_exposure_s,
         response=recipe.light.response(),
         sensing=recipe.sensing,
+        vignetting=recipe.light.vignetting,
     )
 
 
@@ -183,6 +188,7 @@ def _left_out(recipe: Recipe, part: Part, *, given: bool) -> tuple[str, ...]:
         "detection: left out, the poses are given": given,
         "second camera: left out, sensing.stereo is off": not recipe.sensing.stereo,
         "light fall-off: left out, light.fall_off is off": not recipe.light.fall_off,
+        "projector vignetting: left out, light.vignetting is 0": recipe.light.vignetting == 0,
         "occlusion by other parts: left out, light.shadows is not 'all'": recipe.light.shadows != "all",
         "occlusion by the own part: left out, light.shadows is 'none'": recipe.light.shadows == "none",
         "score of all candidates: left out, the strategy does not compare them": (

@@ -82,9 +82,10 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
     while True:
         # 3: G_i of each candidate, equation (13), unless the scan ends here anyway
         stop, best = _spent(step, recipe.planning), None
+        missing = completion.missing | step.doubtful
         if stop is None:
             with stopwatch.stage("score"):
-                step = replace(step, scores=_score(cell, stages, planner, taken, completion.missing | step.doubtful))
+                step = replace(step, scores=_score(cell, stages, planner, taken, missing))
             best = best_of(step.scores)
             stop = _not_worth_it(step, best, recipe.planning)
 
@@ -108,6 +109,7 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
             step, index=step.index + 1, view=view, frame=frame, depth_m=completion.depth_m.copy(),
             source=completion.source.copy(), doubtful=doubtful, recovered_px=recovered_px,
             predicted_gain_px=best.gain_px, measured_gain_px=float(recovered_px - step.recovered_px), scores=(),
+            forecast=planner.forecast(view, missing, completion.missing | doubtful),
         )  # fmt: skip
 
 

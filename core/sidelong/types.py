@@ -136,7 +136,8 @@ class Score:
     gain_px
         G_i of equation (13): expected number of missing pixels the view measures.
     lost_px
-        Expected pixels lost, by reason: outside, hidden, shadow, dark, saturated.
+        Expected pixels lost, by reason: outside, hidden, shadow, dark, saturated. With the gain they add up to the
+        missing pixels that hypotheses explain.
     dropped
         Why the candidate cannot be taken (already taken, unreachable ...); None where it can.
     """
@@ -145,6 +146,25 @@ class Score:
     gain_px: float
     lost_px: Mapping[str, float] = field(default_factory=dict[str, float])
     dropped: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """What the planner promised of a view beside what the view gave, one row for each point of its belief.
+
+    Attributes
+    ----------
+    probability
+        (N,) that the view measures the pixel; their sum over ``weight`` is the predicted gain.
+    weight
+        (N,) how many pixels a point stands for, times the probability of its hypothesis.
+    measured
+        (N,) whether the pixel has depth since this view.
+    """
+
+    probability: FloatArray
+    weight: FloatArray
+    measured: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +201,8 @@ class Step:
         Why the scan ended, on the last step; None before it.
     left_out
         Terms of the model that were left out, each with the reason.
+    forecast
+        What was promised of this view, point by point, beside what it gave; None at the reference.
     """
 
     index: int
@@ -198,6 +220,7 @@ class Step:
     stage_s: Mapping[str, float]
     stop: Stop | None
     left_out: tuple[str, ...] = ()
+    forecast: Forecast | None = None
 
     @property
     def completeness(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sidelong.devices import ArmState, CaptureRequest
 from sidelong.errors import DeviceUnavailableError, ImageError, MotionRefusedError
-from sidelong.evaluation.dataset import Dataset, Scene
 from sidelong.geometry.camera_model import StereoRig
 from sidelong.geometry.transforms import invert, rotation_angle, validated_transform
+from sidelong.recorded.dataset import Dataset, Scene
 from sidelong.types import FloatArray, Frame, View
 
 SAME_PLACE_M, SAME_TURN_RAD = 1e-6, 1e-6
@@ -100,6 +101,11 @@ class ReplayCamera:
         return "replay camera"
 
     @property
+    def serial(self) -> str:
+        """Serial number of the camera that recorded; raises DeviceUnavailableError when closed."""
+        return self._recording.scene.dataset.serial
+
+    @property
     def rig(self) -> StereoRig:
         """Intrinsics, baseline and projector; raises DeviceUnavailableError when closed."""
         return self._recording.scene.dataset.rig
@@ -117,11 +123,7 @@ class ReplayCamera:
         self._recording.close()
 
     def capture(self, request: CaptureRequest, base_T_camera: FloatArray) -> Frame:
-        """Return what was recorded at ``base_T_camera`` (4, 4).
-
-        A depth map needs no image: where no pattern image was recorded, ``left`` is the one with the projector off,
-        and ``projector`` says so. The exposure is the recorded one, the requested one where the recording does not
-        tell.
+        """Return what was recorded at ``base_T_camera`` (4, 4), see ``Scene.frame``.
 
         Raises
         ------
@@ -136,22 +138,8 @@ class ReplayCamera:
         view = self._recording.at(pose)
         if view is None:
             raise ImageError(f"{self.name}: {self._recording.off_the_views(pose)}")
-        shown = request.projector
-        left = scene.image(view.name, shown)
-        if left is None and request.depth:
-            left = scene.image(view.name, shown := type(shown).OFF)
-        if left is None:
-            raise ImageError(f"{scene.folder}: view {view.name} has no left image with the projector at {shown}")
-        return Frame(
-            view=View(view.name, pose),
-            left=left,
-            right=scene.image(view.name, shown, "RIGHT"),
-            depth_m=scene.depth_m(view.name) if request.depth else None,
-            projector=shown,
-            exposure_s=scene.exposure_s(view.name, request.projector) or request.exposure_s,
-            started_s=started_s,
-            ended_s=time.monotonic(),
-        )
+        frame = scene.frame(View(view.name, pose), request)
+        return replace(frame, started_s=started_s, ended_s=time.monotonic())
 
 
 class ReplayArm:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
@@ -29,9 +30,11 @@ class SimulatedCameraSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    serial: str = Field(default="simulated", min_length=1, description="by which calibrations know it")
     part: str = Field(default="tube_fitting", description="name of a simulated part")
     count: int = Field(default=10, ge=0, le=200, description="how many lie in the bin")
     seed: int = Field(default=0, ge=0, description="how they lie")
+    sprayed: bool = Field(default=False, description="whether the parts are covered with anti-reflective spray")
     width: int = Field(default=640, ge=80, le=2560, description="image width in pixels")
     height: int = Field(default=512, ge=64, le=2048, description="image height in pixels, 4/5 of the width")
     bin: Bin = Field(default=Bin(), description="sizes of the bin")
@@ -57,6 +60,12 @@ class SimulatedCamera:
     def name(self) -> str:
         """The device's name in messages."""
         return "simulated camera"
+
+    @property
+    def serial(self) -> str:
+        """Serial number, as the settings say; raises DeviceUnavailableError when closed."""
+        self._opened()
+        return self.settings.serial
 
     @property
     def rig(self) -> StereoRig:
@@ -100,7 +109,9 @@ class SimulatedCamera:
         rig = rig_for(settings.width, settings.height)
         part = simulated_part(settings.part)
         base_T_objects = fill_bin(part, settings.count, settings.seed, self.base_T_bin, settings.bin)
-        scene = [(settings.bin.part(), self.base_T_bin), *((part, pose) for pose in base_T_objects)]
+        # spray makes every surface matte
+        shown = replace(part, materials=("matte",) * len(part.materials)) if settings.sprayed else part
+        scene = [(settings.bin.part(), self.base_T_bin), *((shown, pose) for pose in base_T_objects)]
         self._sensor = ActiveStereoSensor(rig, scene, settings.sensor)
         self._part, self._base_T_objects = part, base_T_objects
 

@@ -8,26 +8,28 @@ import logging
 import sqlite3
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 from uuid import uuid4
 
-from fastapi import Depends, FastAPI, Header, Query, Request, Response
+from fastapi import Depends, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import FileResponse
-from pydantic import ValidationError
 from sse_starlette import EventSourceResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from sidelong_service.answers import ArtifactFile, LocalHosts, answer
-from sidelong_service.events import follow, sse
+from sidelong_service.calibration_routes import add_calibration_routes
+from sidelong_service.calibration_store import CalibrationStore
+from sidelong_service.events import PING_S, follow, sse
 from sidelong_service.models import (
     Artifact,
     ArtifactList,
+    CalibrationRequest,
     CellReport,
+    JobEvent,
     Limit,
     Readiness,
     Scan,
@@ -36,7 +38,18 @@ from sidelong_service.models import (
     ScanRequest,
     StopReport,
 )
-from sidelong_service.problems import MEDIA_TYPE, Problem, ServiceError, problem, problem_of, validation_problem
+from sidelong_service.problems import Problem, ServiceError, problem, problem_of, validation_problem
+from sidelong_service.routing import (
+    EVENTS,
+    PROBLEM,
+    Cursor,
+    LastEvent,
+    Service,
+    TheService,
+    body_of,
+    described_body,
+    documented,
+)
 from sidelong_service.settings import ServiceSettings
 from sidelong_service.storage import Storage
 from sidelong_service.storage_thread import StorageThread
@@ -45,31 +58,11 @@ from sidelong_service.supervisor import Supervisor
 log = logging.getLogger(__name__)
 
 DATABASE = "sidelong.sqlite"
-LARGEST_BODY = 256 * 1024
-PING_S = 15
 
-_PROBLEM: dict[str, Any] = {
-    "description": "A problem",
-    "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-}
-_EVENTS: dict[str, Any] = {
-    "description": "Server-sent events: id, event (its kind) and data (a ScanEvent as JSON)",
-    "content": {"text/event-stream": {"schema": {"type": "string"}}},
-}
 _FILE: dict[str, Any] = {
     "description": "The file; a part of it where a Range was asked for",
     "content": {media_type: {} for media_type in ("application/json", "application/octet-stream", "image/png")},
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Service:
-    """What the routes work with."""
-
-    settings: ServiceSettings
-    storage: StorageThread
-    supervisor: Supervisor
-    loop: asyncio.AbstractEventLoop
 
 
 def create_app(settings: ServiceSettings) -> FastAPI:
@@ -79,8 +72,9 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncGenerator[None]:
         storage = StorageThread(settings.data_dir / DATABASE)
         await storage.open()
-        supervisor = Supervisor(settings, storage, new_id=lambda: uuid4().hex)
-        app.state.service = Service(settings, storage, supervisor, asyncio.get_running_loop())
+        calibrations = CalibrationStore(settings.data_dir / "calibrations")
+        supervisor = Supervisor(settings, storage, calibrations, new_id=lambda: uuid4().hex)
+        app.state.service = Service(settings, storage, calibrations, supervisor, asyncio.get_running_loop())
         await supervisor.start()
         try:
             yield
@@ -101,33 +95,13 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     app.add_middleware(LocalHosts, host=settings.host)
     _add_scan_routes(app)
     _add_cell_routes(app)
+    add_calibration_routes(app)
     _add_problem_handlers(app)
     app.openapi = lambda: _openapi(app)
     return app
 
 
-def service_of(request: Request) -> Service:
-    """Return what the lifespan made."""
-    return cast("Service", request.app.state.service)
-
-
-async def scan_request(request: Request) -> ScanRequest:
-    """Read the body as strict JSON: NaN, 1e999, booleans for numbers and unknown fields are errors."""
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media_type != "application/json":
-        raise ServiceError(problem("media-type", f"The body's media type is {media_type or 'not given'!r}."))
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > LARGEST_BODY:
-            raise ServiceError(problem("too-large", f"The body has more than {LARGEST_BODY} bytes."))
-    try:
-        return ScanRequest.model_validate_json(bytes(body))
-    except ValidationError as error:
-        raise ServiceError(validation_problem(cast("Any", error.errors()))) from error
-
-
-async def found_scan(scan_id: str, service: Annotated[Service, Depends(service_of)]) -> Scan:
+async def found_scan(scan_id: str, service: TheService) -> Scan:
     """Return the scan of the path."""
     scan = await service.storage.call(Storage.scan, scan_id)
     if scan is None:
@@ -135,42 +109,35 @@ async def found_scan(scan_id: str, service: Annotated[Service, Depends(service_o
     return scan
 
 
-TheService = Annotated[Service, Depends(service_of)]
 FoundScan = Annotated[Scan, Depends(found_scan)]
 
 
-def _documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    return dict.fromkeys(statuses, _PROBLEM)
-
-
 def _add_scan_routes(app: FastAPI) -> None:
-    body = {"required": True, "content": {"application/json": {"schema": {"$ref": "#/components/schemas/ScanRequest"}}}}
-
     @app.post(
         "/v1/scans",
         status_code=202,
         response_model=Scan,
-        responses=_documented(404, 409, 413, 415, 422, 503),
-        openapi_extra={"requestBody": body},
+        responses=documented(404, 409, 413, 415, 422, 503),
+        openapi_extra=described_body(ScanRequest),
     )
     async def start_scan(
-        wanted: Annotated[ScanRequest, Depends(scan_request)], service: TheService, response: Response
+        wanted: Annotated[ScanRequest, Depends(body_of(ScanRequest))], service: TheService, response: Response
     ) -> Scan | None:
         """Accept a scan; it runs by itself, its course is told under the Location."""
         scan_id = await service.supervisor.submit(wanted)
         response.headers["Location"] = f"/v1/scans/{scan_id}"
         return await service.storage.call(Storage.scan, scan_id)
 
-    @app.get("/v1/scans", response_model=ScanList, responses=_documented(422))
+    @app.get("/v1/scans", response_model=ScanList, responses=documented(422))
     async def list_scans(
         service: TheService,
         limit: Limit = 50,
-        cursor: Annotated[int | None, Query(ge=1, lt=2**63)] = None,
+        cursor: Cursor = None,
     ) -> ScanList:
         """List scans, newest first."""
         return await service.storage.call(Storage.scans, limit, cursor)
 
-    @app.get("/v1/scans/{scan_id}", response_model=Scan, responses=_documented(404))
+    @app.get("/v1/scans/{scan_id}", response_model=Scan, responses=documented(404))
     async def show_scan(scan: FoundScan) -> Scan:
         """Show a scan with its views so far."""
         return scan
@@ -178,18 +145,18 @@ def _add_scan_routes(app: FastAPI) -> None:
     @app.get(
         "/v1/scans/{scan_id}/events",
         response_class=EventSourceResponse,
-        responses={200: _EVENTS, **_documented(404, 422)},
+        responses={200: EVENTS, **documented(404, 422)},
     )
     async def follow_scan(
         scan: FoundScan,
         service: TheService,
-        last_event_id: Annotated[int, Header(ge=0, lt=2**63)] = 0,
+        last_event_id: LastEvent = 0,
     ) -> EventSourceResponse:
         """Tell the course of a scan, from the start or after ``Last-Event-ID``, until it has ended."""
         events = follow(service.storage, service.supervisor.bulletin, scan.id, last_event_id)
         return EventSourceResponse((sse(event) async for event in events), ping=PING_S)
 
-    @app.get("/v1/scans/{scan_id}/artifacts", response_model=ArtifactList, responses=_documented(404))
+    @app.get("/v1/scans/{scan_id}/artifacts", response_model=ArtifactList, responses=documented(404))
     async def list_artifacts(scan: FoundScan) -> ArtifactList:
         """List the files of a scan."""
         return ArtifactList(artifacts=scan.artifacts)
@@ -197,7 +164,7 @@ def _add_scan_routes(app: FastAPI) -> None:
     @app.get(
         "/v1/scans/{scan_id}/artifacts/{name}",
         response_class=FileResponse,
-        responses={200: _FILE, 206: _FILE, **_documented(400, 404, 416)},
+        responses={200: _FILE, 206: _FILE, **documented(400, 404, 416)},
     )
     async def read_artifact(scan: FoundScan, name: str, service: TheService) -> FileResponse:
         """Read a file of a scan."""
@@ -225,7 +192,7 @@ def _add_cell_routes(app: FastAPI) -> None:
         """Show the cell, and whether a scan may start now."""
         return service.supervisor.cell()
 
-    @app.post("/v1/cell/stop", response_model=StopReport, responses=_documented(504))
+    @app.post("/v1/cell/stop", response_model=StopReport, responses=documented(504))
     async def stop_cell(service: TheService) -> StopReport:
         """Stop the arm at once, and the active scan; harmless when repeated."""
         return StopReport(scan=await service.supervisor.stop())
@@ -279,7 +246,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
-        for model in (ScanRequest, ScanEvent, Problem):
+        for model in (ScanRequest, ScanEvent, CalibrationRequest, JobEvent, Problem):
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(schema.pop("$defs", {}))
             schemas[model.__name__] = schema
@@ -295,6 +262,6 @@ def _correct_responses(document: dict[str, Any]) -> None:
             responses = operation["responses"]
             if "HTTPValidationError" in json.dumps(responses.get("422")):
                 del responses["422"]
-            responses["default"] = _PROBLEM
+            responses["default"] = PROBLEM
     for name in ("HTTPValidationError", "ValidationError"):
         document["components"]["schemas"].pop(name, None)

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sidelong.calibration.light_fit import fit_intensity
+from sidelong.commissioning.applied import calibrated, calibrated_mount
+from sidelong.commissioning.documents import Document
+from sidelong.commissioning.white import lit_by_recording
 from sidelong.devices import Arm, Camera, Cell
 from sidelong.errors import UnknownNameError
-from sidelong.evaluation.dataset import Dataset
 from sidelong.geometry.mesh import Part, load_part
 from sidelong.geometry.transforms import validated_transform
 from sidelong.planning.candidates import dome_views
-from sidelong.recipe import Recipe, light_model
+from sidelong.recipe import Recipe
+from sidelong.recorded.dataset import Dataset
 from sidelong.simulation.parts import simulated_part
 from sidelong.types import View
 from sidelong_drivers.registry import create_camera
-from sidelong_service.messages import CellJob, Job, RecordingJob
+from sidelong_service.messages import CapturesJob, CellJob, Job, RecordingJob, ScanJob, Settings
 from sidelong_service.settings import SIMULATED_PART, CellSettings, DriverSettings
 
 AROUND_TARGET_M = 0.08
@@ -39,7 +42,7 @@ class Plan:
     candidates: tuple[View, ...]
 
 
-def plan_of(job: Job, recipe: Recipe) -> Plan:
+def plan_of(job: ScanJob, recipe: Recipe) -> Plan:
     """Find all that a job names. Nothing is opened and nothing moves.
 
     Raises
@@ -52,29 +55,43 @@ def plan_of(job: Job, recipe: Recipe) -> Plan:
     return plan
 
 
-def effective_recipe(job: Job, recipe: Recipe, part: Part) -> Recipe:
-    """Return a recipe with what it leaves open filled in.
+def check(job: Job, settings: Settings) -> None:
+    """Find all that a job names, as far as that can be done with no device open.
+
+    Raises
+    ------
+    InputError
+        A name is unknown, a file cannot be used, or a calibration does not fit the recorded device.
+    """
+    if isinstance(job, CapturesJob):
+        calibrated(settings.recipe, settings.documents, Dataset(job.root).serial)
+        return
+    plan_of(job, settings.recipe)
+    if isinstance(job, RecordingJob):
+        calibrated(settings.recipe, settings.documents, Dataset(job.root).serial)
+
+
+def effective_recipe(job: ScanJob, settings: Settings, part: Part, camera_serial: str) -> Recipe:
+    """Return the recipe of a job with its calibrations in it, and with what it leaves open filled in.
 
     The distances of the templates come from the reference view or the recorded depth; the projector's intensity is
-    fitted where recorded data have a white capture.
+    fitted where recorded data have a white capture and no calibration tells.
 
     Raises
     ------
     InputError
         A recorded file cannot be used.
+    CalibrationError
+        A calibration is of another device, or does not go with the others.
     """
+    recipe = calibrated(settings.recipe, settings.documents, camera_serial)
     if isinstance(job, CellJob):
         distance_m = job.cell.dome.distances_m[0]
         return _reaching(recipe, (distance_m - AROUND_TARGET_M, distance_m + AROUND_TARGET_M))
     dataset = Dataset(job.root)
     if recipe.detection.distance_m is None:
         recipe = _reaching(recipe, dataset.scene(job.object, job.scene).distance_range_m())
-    white = dataset.white_capture(job.object) if recipe.light.intensity is None else None
-    if white is None:
-        return recipe
-    fit = fit_intensity(white.frame, white.base_T_objects, part, dataset.rig, light_model(recipe, part))
-    light = recipe.light.model_copy(update={"intensity": fit.intensity})
-    return recipe.model_copy(update={"light": light})
+    return lit_by_recording(recipe, dataset, job.object, part)
 
 
 def _reaching(recipe: Recipe, distances_m: tuple[float, float] | None) -> Recipe:
@@ -118,9 +135,10 @@ class Cameras:
         self._kept = None
 
 
-def cell_of(plan: Plan, camera: Camera, arm: Arm) -> Cell:
-    """Return the cell of a plan and its open devices."""
-    flange_T_camera = validated_transform(plan.flange_T_camera, "cell.flange_T_camera")
+def cell_of(plan: Plan, camera: Camera, arm: Arm, documents: Sequence[Document] = ()) -> Cell:
+    """Return the cell of a plan and its open devices; a hand-eye calibration goes before the configured transform."""
+    configured = validated_transform(plan.flange_T_camera, "cell.flange_T_camera")
+    flange_T_camera = calibrated_mount(configured, documents)
     return Cell(camera, arm, flange_T_camera, plan.reference, plan.candidates)
 
 

@@ -20,6 +20,7 @@ from sidelong_service.messages import (
     ArmFailed,
     ArmReady,
     ArmStopped,
+    CalibrateJob,
     CancelJob,
     CheckJob,
     FromWorker,
@@ -228,7 +229,7 @@ class WorkerLink:
             raise ChildGoneError(f"the scan worker answered {answer.kind} to a check")
         return answer.problem
 
-    def run(self, job: RunJob) -> None:
+    def run(self, job: RunJob | CalibrateJob) -> None:
         """Start a job; its course comes from ``next``."""
         self._send(job)
 

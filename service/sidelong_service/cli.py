@@ -3,23 +3,35 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import ValidationError
-from rich.console import Console
-from rich.markup import escape
 
+from sidelong.commissioning.documents import Document
 from sidelong.errors import SidelongError
 from sidelong.planning.selection import StrategyName
 from sidelong.recipe import Recipe
-from sidelong_service.client import ClientError, SidelongClient
+from sidelong_service.calibrate_command import calibrate
+from sidelong_service.client import SidelongClient
+from sidelong_service.command import (
+    Calibrations,
+    CommandError,
+    ConfigFile,
+    RecipeFile,
+    documents_of,
+    err,
+    first_fields,
+    ids_of,
+    out,
+    plain_errors,
+    recipe_of,
+)
 from sidelong_service.console import CountedProgress, ScanProgress, comparison_table, view_table
-from sidelong_service.models import EventKind, RecordedScene, ScanRequest, ScanState
-from sidelong_service.problems import validation_problem
+from sidelong_service.models import EventKind, RecordedScene, RunState, ScanRequest
+from sidelong_service.record_command import record
 
 if TYPE_CHECKING:  # open3d and what needs it wait for the commands that use them
     from sidelong.evaluation.cases import Case
@@ -32,30 +44,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-out = Console()
-err = Console(stderr=True)
+app.add_typer(calibrate)
+app.add_typer(record)
 
 Part = Annotated[str | None, typer.Option(help="Part in the configured cell.")]
-RecipeFile = Annotated[Path | None, typer.Option("--recipe", help="JSON file with settings of the scan.")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML file with settings of the service.")]
 
 FOLDER_ID = "folder"
 """Id of a data set that is given by its folder: requests name ids, never paths."""
-
-
-class CommandError(Exception):
-    """A command cannot do what it was asked for; the message says why."""
-
-
-@contextmanager
-def plain_errors() -> Generator[None]:
-    """Show expected errors as one line and exit with 1."""
-    try:
-        yield
-    except (CommandError, ClientError, SidelongError, OSError) as error:
-        # paths may hold what rich takes for markup
-        err.print("[bold red]error[/]:", escape(str(error)), highlight=False, soft_wrap=True)
-        raise typer.Exit(1) from error
 
 
 @app.command()
@@ -85,6 +80,7 @@ def scan(
     scene: Annotated[int, typer.Option(min=0)] = 1,
     reference: Annotated[str | None, typer.Option(help="View whose depth is completed.")] = None,
     recipe: RecipeFile = None,
+    calibration: Calibrations = None,
     url: Annotated[str | None, typer.Option(help="Service that scans; none: this process.")] = None,
     config: ConfigFile = None,
     output: Annotated[Path, typer.Option(help="Folder for the files of the scan.")] = Path("sidelong-output"),
@@ -93,12 +89,12 @@ def scan(
     with plain_errors():
         folder = Path(dataset) if dataset is not None and url is None and Path(dataset).is_dir() else None
         source = FOLDER_ID if folder is not None else dataset
-        request = _request(part, source, object_name, scene, reference, recipe)
+        request = _request(part, source, object_name, scene, reference, recipe_of(recipe, ids_of(calibration)))
         if url is not None:
             with SidelongClient(url) as client:
                 scan_on_service(client, request, output)
         else:
-            _scan_here(request, config, folder, output)
+            _scan_here(request, documents_of(calibration), config, folder, output)
 
 
 @app.command()
@@ -126,19 +122,20 @@ def compare(
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs of the random strategy.")] = 5,
     true_poses: Annotated[bool, typer.Option("--true-poses", help="Leave out detection; take the true poses.")] = False,
     recipe: RecipeFile = None,
+    calibration: Calibrations = None,
     config: ConfigFile = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="File for all rows.")] = None,
     plot: Annotated[Path, typer.Option(help="File for the plot, PNG.")] = Path("sidelong-comparison.png"),
 ) -> None:
     """Compare strategies on recorded scenes: completeness after each view, and against seconds."""
     from sidelong.evaluation.cases import cases_of
-    from sidelong.evaluation.dataset import Dataset
+    from sidelong.recorded.dataset import Dataset
     from sidelong_service.comparison import Comparison
     from sidelong_service.settings import load_settings
 
     with plain_errors():
         names = None if references == "all" else [name for name in references.split(",") if name]
-        settings = _recipe(recipe)
+        settings = recipe_of(recipe, ids_of(calibration))
         planning = settings.planning.model_copy(update={"max_views": views})
         recorded = Dataset(dataset)
         comparison = Comparison(
@@ -148,6 +145,7 @@ def compare(
             recipe=settings.model_copy(update={"planning": planning}),
             cache_dir=load_settings(config).data_dir / "templates",
             true_poses=true_poses,
+            documents=documents_of(calibration),
         )
         _compare(comparison, json_file, plot)
 
@@ -236,12 +234,14 @@ def scan_on_service(client: SidelongClient, request: ScanRequest, output: Path) 
     ended = client.scan(accepted.id)
     files = [client.download(ended.id, artifact.name, output) for artifact in ended.artifacts]
     _conclude(progress, files, str(ended.finish_reason or ended.state))
-    if ended.state is not ScanState.SUCCEEDED:
+    if ended.state is not RunState.SUCCEEDED:
         why = f"{ended.problem.title}: {ended.problem.detail}" if ended.problem is not None else "it was stopped"
         raise CommandError(f"scan {ended.id} {ended.state}: {why}")
 
 
-def _scan_here(request: ScanRequest, config: Path | None, folder: Path | None, output: Path) -> None:
+def _scan_here(
+    request: ScanRequest, documents: tuple[Document, ...], config: Path | None, folder: Path | None, output: Path
+) -> None:
     """Run a scan in this process, of the data set in ``folder`` if there is one; Ctrl-C stops the arm."""
     from sidelong_service.local import LocalScan
     from sidelong_service.settings import load_settings
@@ -249,6 +249,9 @@ def _scan_here(request: ScanRequest, config: Path | None, folder: Path | None, o
     settings = load_settings(config)
     if folder is not None:
         settings = settings.model_copy(update={"datasets": {FOLDER_ID: folder}})
+    elif request.recording is not None and request.recording.dataset not in settings.datasets:
+        known = ", ".join(sorted(settings.datasets)) or "none"
+        raise CommandError(f"dataset: {request.recording.dataset!r} is neither a folder nor known, known are {known}")
     with ScanProgress(out) as progress:
         files: list[Path] = []
 
@@ -257,7 +260,7 @@ def _scan_here(request: ScanRequest, config: Path | None, folder: Path | None, o
             if kind == "artifact":
                 files.append(output / data["name"])
 
-        reason = LocalScan(settings, request, output, note).run()
+        reason = LocalScan(settings, request, documents, output, note).run()
     _conclude(progress, files, str(reason))
 
 
@@ -270,28 +273,16 @@ def _conclude(progress: ScanProgress, files: list[Path], ending: str) -> None:
 
 
 def _request(
-    part: str | None, dataset: str | None, object_name: str | None, scene: int, reference: str | None, file: Path | None
+    part: str | None, dataset: str | None, object_name: str | None, scene: int, reference: str | None, recipe: Recipe
 ) -> ScanRequest:
     if (part is None) == (dataset is None):
         raise CommandError("give either --part, for the configured cell, or --dataset with --object")
     if dataset is not None and object_name is None:
         raise CommandError("--dataset needs --object")
-    recipe = _recipe(file)
     try:
         if dataset is None or object_name is None:
             return ScanRequest(part=part, recipe=recipe)
         recording = RecordedScene(dataset=dataset, object=object_name, scene=scene, reference=reference)
         return ScanRequest(recording=recording, recipe=recipe)
     except ValidationError as error:
-        raise CommandError(_first_fields(error)) from error
-
-
-def _recipe(file: Path | None) -> Recipe:
-    try:
-        return Recipe() if file is None else Recipe.model_validate_json(file.read_bytes())
-    except ValidationError as error:
-        raise CommandError(f"{file}: {_first_fields(error)}") from error
-
-
-def _first_fields(error: ValidationError) -> str:
-    return validation_problem([dict(each) for each in error.errors()]).detail
+        raise CommandError(first_fields(error)) from error

@@ -15,7 +15,11 @@ from pydantic import BaseModel, ValidationError
 from sidelong_service.models import (
     Artifact,
     ArtifactList,
+    CalibrationJob,
+    CalibrationList,
+    CalibrationRequest,
     CellReport,
+    JobEvent,
     Readiness,
     Scan,
     ScanEvent,
@@ -86,17 +90,7 @@ class SidelongClient:
 
     def events(self, scan_id: str, after: int = 0) -> Iterator[ScanEvent]:
         """Yield the events of a scan after the given one, as they come, until it has ended."""
-        headers = {"Last-Event-ID": str(after)}
-        try:
-            with self._http.stream("GET", f"/v1/scans/{scan_id}/events", headers=headers) as response:
-                if response.is_error:
-                    response.read()
-                    raise self._error(response)
-                for line in response.iter_lines():
-                    if line.startswith("data:"):
-                        yield ScanEvent.model_validate(json.loads(line.removeprefix("data:")))
-        except httpx.HTTPError as error:
-            raise self._unreachable(error) from error
+        yield from (ScanEvent.model_validate(event) for event in self._stream(f"/v1/scans/{scan_id}/events", after))
 
     def artifacts(self, scan_id: str) -> tuple[Artifact, ...]:
         """Return the names of a scan's files."""
@@ -104,11 +98,37 @@ class SidelongClient:
 
     def download(self, scan_id: str, name: str, folder: Path) -> Path:
         """Fetch a file of a scan into a folder and return its path."""
-        response = self._send("GET", f"/v1/scans/{scan_id}/artifacts/{name}")
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / name
-        path.write_bytes(response.content)
-        return path
+        return self._fetch(f"/v1/scans/{scan_id}/artifacts/{name}", folder / name)
+
+    def start_job(self, request: CalibrationRequest) -> CalibrationJob:
+        """Start a calibration. Raises ProblemError where it is not accepted."""
+        content = request.model_dump_json(exclude_unset=True)
+        headers = {"Content-Type": "application/json"}
+        return self._ask(CalibrationJob, "POST", "/v1/jobs", content=content, headers=headers)
+
+    def job(self, job_id: str) -> CalibrationJob:
+        """Return a calibration job."""
+        return self._ask(CalibrationJob, "GET", f"/v1/jobs/{job_id}")
+
+    def job_events(self, job_id: str, after: int = 0) -> Iterator[JobEvent]:
+        """Yield the events of a job after the given one, as they come, until it has ended."""
+        yield from (JobEvent.model_validate(event) for event in self._stream(f"/v1/jobs/{job_id}/events", after))
+
+    def cancel_job(self, job_id: str) -> CalibrationJob:
+        """Ask a job to end."""
+        return self._ask(CalibrationJob, "POST", f"/v1/jobs/{job_id}/cancel")
+
+    def calibrations(self) -> CalibrationList:
+        """Return what calibrations there are, newest first."""
+        return self._ask(CalibrationList, "GET", "/v1/calibrations")
+
+    def download_calibration(self, calibration_id: str, folder: Path) -> tuple[Path, Path]:
+        """Fetch a calibration file and its picture into a folder and return their paths."""
+        path = f"/v1/calibrations/{calibration_id}"
+        return (
+            self._fetch(path, folder / f"{calibration_id}.json"),
+            self._fetch(f"{path}/picture", folder / f"{calibration_id}.png"),
+        )
 
     def stop(self) -> StopReport:
         """Stop the arm and the active scan. Raises ProblemError where the arm did not confirm."""
@@ -134,6 +154,24 @@ class SidelongClient:
             lacking = f"arm: {readiness.arm}, worker: {readiness.worker}, storage: {readiness.storage}"
             time.sleep(0.05)
         raise ClientError(f"{self._url}: the service is not ready after {timeout_s:g} s ({lacking})")
+
+    def _stream(self, path: str, after: int) -> Iterator[Any]:
+        try:
+            with self._http.stream("GET", path, headers={"Last-Event-ID": str(after)}) as response:
+                if response.is_error:
+                    response.read()
+                    raise self._error(response)
+                for line in response.iter_lines():
+                    if line.startswith("data:"):
+                        yield json.loads(line.removeprefix("data:"))
+        except httpx.HTTPError as error:
+            raise self._unreachable(error) from error
+
+    def _fetch(self, path: str, target: Path) -> Path:
+        response = self._send("GET", path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(response.content)
+        return target
 
     def _ask(self, kind: type[Answer], method: str, path: str, **options: Any) -> Answer:
         response = self._send(method, path, **options)

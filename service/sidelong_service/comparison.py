@@ -9,16 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
+from sidelong.commissioning.documents import Document
 from sidelong.devices import Cell
 from sidelong.errors import DepthError
 from sidelong.evaluation.cases import Case, true_objects, truth_in
 from sidelong.evaluation.compare import Row, Run, compare_reference
-from sidelong.evaluation.dataset import Dataset, Scene
 from sidelong.recipe import GivenObjects, Recipe, Stages, build_stages
+from sidelong.recorded.dataset import Dataset, Scene
 from sidelong.types import DetectedObject
 from sidelong_drivers.registry import create_arm, create_camera
 from sidelong_service.cells import effective_recipe
-from sidelong_service.messages import RecordingJob
+from sidelong_service.messages import RecordingJob, Settings
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class Comparison:
         Where trained templates are kept.
     true_poses
         Whether the true poses stand in for detection.
+    documents
+        Calibrations that go before what the recipe says.
     """
 
     dataset: Dataset
@@ -47,6 +50,7 @@ class Comparison:
     recipe: Recipe
     cache_dir: Path
     true_poses: bool = False
+    documents: tuple[Document, ...] = ()
 
     def rows(
         self, skipped: Callable[[Case, str], None], progress: Callable[[int, int], None] | None = None
@@ -63,7 +67,8 @@ class Comparison:
         for object_name, number in dict.fromkeys((case.object, case.scene) for case in self.cases):
             scene, part = self.dataset.scene(object_name, number), self.dataset.part(object_name)
             job = RecordingJob(root=self.dataset.root, object=object_name, scene=number, reference=None)
-            recipe = effective_recipe(job, self.recipe, part)
+            settings = Settings(recipe=self.recipe, documents=self.documents)
+            recipe = effective_recipe(job, settings, part, self.dataset.serial)
             given: tuple[DetectedObject, ...] | None = () if self.true_poses else None
             with build_stages(
                 recipe, part, self.dataset.rig, self.cache_dir, objects=given, progress=progress

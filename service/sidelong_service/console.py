@@ -8,7 +8,16 @@ from typing import Any, Self
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Table
 
 from sidelong.evaluation.tradeoff import Point
@@ -17,23 +26,11 @@ from sidelong_service.models import EventKind, ViewReport
 STAGES = ("move", "capture", "detect", "score", "fuse")
 
 
-class ScanProgress:
-    """Shows the events of a scan as they come. A context manager."""
+class _Bars:
+    """Bars that are there while work is done. A context manager."""
 
-    def __init__(self, console: Console) -> None:
-        self.views: list[ViewReport] = []
-        self._console = console
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=30),
-            TextColumn("{task.fields[state]}"),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-        )
-        self._phase: TaskID = self._progress.add_task("starting", total=None, state="")
-        self._work: TaskID | None = None
+    def __init__(self, console: Console, *columns: ProgressColumn) -> None:
+        self._progress = Progress(*columns, TimeElapsedColumn(), console=console, transient=True)
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -43,6 +40,21 @@ class ScanProgress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._progress.stop()
+
+    def note(self, text: str) -> None:
+        """Print a line above the bars."""
+        self._progress.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+class ScanProgress(_Bars):
+    """Shows the events of a scan as they come. A context manager."""
+
+    def __init__(self, console: Console) -> None:
+        state = TextColumn("{task.fields[state]}")
+        super().__init__(console, SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30), state)
+        self.views: list[ViewReport] = []
+        self._phase: TaskID = self._progress.add_task("starting", total=None, state="")
+        self._work: TaskID | None = None
 
     def show(self, kind: EventKind, data: Mapping[str, Any]) -> None:
         """Show an event."""
@@ -71,7 +83,7 @@ class ScanProgress:
             text = f"{view.objects} objects, {view.missing_px} px without depth on them"
         else:
             text = f"gain {view.measured_gain_px:.0f} px, {view.completeness:.1%} complete"
-        self._console.print(f"  view {view.index}  {view.view}: {text}", highlight=False)
+        self.note(f"  view {view.index}  {view.view}: {text}")
 
 
 def view_table(views: Sequence[ViewReport]) -> Table:
@@ -87,32 +99,18 @@ def view_table(views: Sequence[ViewReport]) -> Table:
     return table
 
 
-class CountedProgress:
+class CountedProgress(_Bars):
     """Shows how much of a counted work is done, and how much a preparation. A context manager."""
 
     def __init__(self, console: Console) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn())
-        self._progress = Progress(*columns, console=console, transient=True)
+        super().__init__(console, TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn())
         self._tasks: dict[str, TaskID] = {}
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._progress.stop()
 
     def show(self, work: str, done: int, total: int) -> None:
         """Show how far a work is; one that is done disappears."""
         if work not in self._tasks:
             self._tasks[work] = self._progress.add_task(work, total=total)
         self._progress.update(self._tasks[work], completed=done, total=total, visible=done < total)
-
-    def note(self, text: str) -> None:
-        """Print a line above the bars."""
-        self._progress.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def comparison_table(points: Sequence[Point]) -> Table:

@@ -1,4 +1,4 @@
-"""The course of a scan as server-sent events: always read from the database, so ids and replay hold by themselves."""
+"""The course of a scan or job as server-sent events, always read from the database: so ids and replay hold."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 
-from sidelong_service.models import ScanEvent
+from sidelong_service.models import JobEvent, ScanEvent
 from sidelong_service.storage import Storage
 from sidelong_service.storage_thread import StorageThread
+
+PING_S = 15
+"""How often a stream that has no news says so."""
 
 
 class Bulletin:
@@ -33,13 +36,15 @@ class Bulletin:
         return self._news
 
 
-async def follow(storage: StorageThread, bulletin: Bulletin, scan_id: str, after: int) -> AsyncIterator[ScanEvent]:
-    """Yield the events of a scan after the given one, as they come, until it has ended or the service ends."""
+async def follow(
+    storage: StorageThread, bulletin: Bulletin, run_id: str, after: int
+) -> AsyncIterator[ScanEvent | JobEvent]:
+    """Yield the events of a scan or job after the given one, as they come, until it has ended or the service ends."""
     while not bulletin.closed:
         news = bulletin.news()
         # in this order: what is added after the first call is news
-        ended = await storage.call(Storage.has_ended, scan_id)
-        events = await storage.call(Storage.events, scan_id, after)
+        ended = await storage.call(Storage.has_ended, run_id)
+        events = await storage.call(Storage.events, run_id, after)
         for event in events:
             after = event.id
             yield event
@@ -49,6 +54,6 @@ async def follow(storage: StorageThread, bulletin: Bulletin, scan_id: str, after
             await news.wait()
 
 
-def sse(event: ScanEvent) -> dict[str, str]:
+def sse(event: ScanEvent | JobEvent) -> dict[str, str]:
     """Return an event in the shape sse-starlette sends."""
     return {"id": str(event.id), "event": event.kind, "data": json.dumps(event.model_dump(mode="json"))}

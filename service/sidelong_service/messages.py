@@ -4,7 +4,7 @@
 
     API      -> arm host   Heartbeat, StopArm, ReleaseArm
     arm host -> API        ArmReady, ArmFailed, ArmStopped
-    API      -> worker     CheckJob, RunJob, CancelJob
+    API      -> worker     CheckJob, RunJob, CalibrateJob, CancelJob
     worker   -> API        WorkerReady, JobChecked, Note, JobDone
     worker   -> arm host   ArmCall
     arm host -> worker     ArmAnswer
@@ -19,6 +19,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from sidelong import errors
+from sidelong.commissioning.documents import Document
+from sidelong.commissioning.tasks import Task
 from sidelong.devices import ArmState
 from sidelong.recipe import Recipe
 from sidelong.types import FloatArray, Stop
@@ -171,7 +173,24 @@ class RecordingJob(Message):
         return {"root": str(self.root), "object": self.object, "scene": self.scene}
 
 
-Job: TypeAlias = Annotated[CellJob | RecordingJob, Field(discriminator="kind")]
+class CapturesJob(Message):
+    """Make a calibration from the captures of a data set."""
+
+    kind: Literal["captures"] = "captures"
+    root: Path
+    object: str | None
+    task: Task
+
+
+ScanJob: TypeAlias = CellJob | RecordingJob
+Job: TypeAlias = Annotated[ScanJob | CapturesJob, Field(discriminator="kind")]
+
+
+class Settings(Message):
+    """The recipe of a job, and the calibrations it names."""
+
+    recipe: Recipe
+    documents: tuple[Document, ...]
 
 
 class CheckJob(Message):
@@ -179,15 +198,24 @@ class CheckJob(Message):
 
     kind: Literal["check"] = "check"
     job: Job
-    recipe: Recipe
+    settings: Settings
+
+
+class CalibrateJob(Message):
+    """Make a calibration; its files go to ``folder``."""
+
+    kind: Literal["calibrate"] = "calibrate"
+    job: CapturesJob
+    settings: Settings
+    folder: Path
 
 
 class RunJob(Message):
     """Run a scan: its files go to ``folder``, the arm listens at ``arm_socket``."""
 
     kind: Literal["run"] = "run"
-    job: Job
-    recipe: Recipe
+    job: Annotated[ScanJob, Field(discriminator="kind")]
+    settings: Settings
     arm_socket: Path
     arm_name: str
     folder: Path
@@ -195,12 +223,12 @@ class RunJob(Message):
 
 
 class CancelJob(Message):
-    """End the running scan as soon as may be."""
+    """End the running job as soon as may be."""
 
     kind: Literal["cancel"] = "cancel"
 
 
-ToWorker: TypeAlias = Annotated[CheckJob | RunJob | CancelJob, Field(discriminator="kind")]
+ToWorker: TypeAlias = Annotated[CheckJob | RunJob | CalibrateJob | CancelJob, Field(discriminator="kind")]
 TO_WORKER: TypeAdapter[ToWorker] = TypeAdapter(ToWorker)
 
 
@@ -218,7 +246,7 @@ class JobChecked(Message):
 
 
 class Note(Message):
-    """Something happened in the running scan."""
+    """Something happened in the running job."""
 
     kind: Literal["note"] = "note"
     event: EventKind
@@ -226,10 +254,11 @@ class Note(Message):
 
 
 class JobDone(Message):
-    """The scan has ended: with a reason, by a cancellation (neither), or with a problem."""
+    """The job has ended: done (a scan with its reason), cancelled, or with a problem."""
 
     kind: Literal["done"] = "done"
     finish_reason: Stop | None = None
+    cancelled: bool = False
     problem: Problem | None = None
 
 

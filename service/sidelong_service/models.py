@@ -8,14 +8,22 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from sidelong.commissioning.tasks import Task
 from sidelong.recipe import Recipe
 from sidelong.types import Step, Stop
 from sidelong_service.problems import Problem
 from sidelong_service.settings import Name
 
 
-class ScanState(StrEnum):
-    """Where a scan stands. ``interrupted``: a process died under it."""
+class RunKind(StrEnum):
+    """What may have the scan worker."""
+
+    SCAN = "scan"
+    CALIBRATION = "calibration"
+
+
+class RunState(StrEnum):
+    """Where a scan or a job stands. ``interrupted``: a process died under it."""
 
     ACCEPTED = "accepted"
     RUNNING = "running"
@@ -27,8 +35,8 @@ class ScanState(StrEnum):
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more happens to the scan."""
-        return self not in (ScanState.ACCEPTED, ScanState.RUNNING, ScanState.STOPPING)
+        """Whether nothing more happens to it."""
+        return self not in (RunState.ACCEPTED, RunState.RUNNING, RunState.STOPPING)
 
 
 class CellState(StrEnum):
@@ -66,6 +74,15 @@ class ScanRequest(_Request):
         if (self.part is None) == (self.recording is None):
             raise ValueError("give either part, for the configured cell, or recording")
         return self
+
+
+class CalibrationRequest(_Request):
+    """Make a calibration from captures of a configured data set; ``recipe.calibrations`` names those it builds on."""
+
+    dataset: Name = Field(description="id of a configured data set")
+    object: Name | None = Field(default=None, description="whose captures; none: those of the device")
+    task: Task
+    recipe: Recipe = Recipe()
 
 
 class _Answer(BaseModel):
@@ -151,7 +168,7 @@ class ScanSummary(_Answer):
     """A scan in the list."""
 
     id: str
-    state: ScanState
+    state: RunState
     phase: str | None
     finish_reason: Stop | None
     part: str | None
@@ -188,6 +205,45 @@ class ArtifactList(_Answer):
     artifacts: tuple[Artifact, ...]
 
 
+class CalibrationJob(_Answer):
+    """A calibration in the making; ``calibrations`` are the ids of what it has made."""
+
+    id: str
+    state: RunState
+    phase: str | None
+    created_at: datetime
+    started_at: datetime | None
+    ended_at: datetime | None
+    request: dict[str, Any]
+    problem: Problem | None
+    calibrations: tuple[str, ...]
+
+
+class JobList(_Answer):
+    """Calibration jobs, newest first; ``next_cursor`` asks for older ones."""
+
+    jobs: tuple[CalibrationJob, ...]
+    next_cursor: int | None
+
+
+class CalibrationSummary(_Answer):
+    """A calibration file in the data directory. One that cannot be used is listed with ``trouble``."""
+
+    id: str
+    kind: str | None
+    material: str | None
+    device_serial: str | None
+    created_at: datetime | None
+    warnings: tuple[str, ...]
+    trouble: str | None = None
+
+
+class CalibrationList(_Answer):
+    """Calibrations, newest first."""
+
+    calibrations: tuple[CalibrationSummary, ...]
+
+
 class CellReport(_Answer):
     """The cell, and whether a scan may start now."""
 
@@ -197,6 +253,7 @@ class CellReport(_Answer):
     camera: str
     arm: str
     active_scan: str | None
+    active_job: str | None
     may_start: bool
     reasons: tuple[str, ...]
 
@@ -217,17 +274,26 @@ class Readiness(_Answer):
     storage: str
 
 
-EventKind = Literal["state", "phase", "progress", "setup", "view", "artifact"]
+EventKind = Literal["state", "phase", "progress", "setup", "view", "artifact", "calibration"]
 
 
-class ScanEvent(_Answer):
-    """One line in the life of a scan, numbered over all scans."""
-
+class _Event(_Answer):
     id: int
-    scan: str
     kind: EventKind
     at: datetime
     data: dict[str, Any]
+
+
+class ScanEvent(_Event):
+    """One line in the life of a scan, numbered over all scans and jobs."""
+
+    scan: str
+
+
+class JobEvent(_Event):
+    """One line in the life of a job, numbered over all scans and jobs."""
+
+    job: str
 
 
 Limit = Annotated[int, Field(ge=1, le=200)]

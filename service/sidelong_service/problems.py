@@ -50,7 +50,8 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
         "depth": Kind(422, 1104, "A depth map carries no measurement", False, "Check exposure, distance and target."),
         "pose": Kind(422, 1105, "A transform is not a rigid motion", False, "Repair the file or setting it names."),
         "mesh": Kind(422, 1106, "The CAD model cannot be used", False, "Export the CAD model again, closed, in mm."),
-        "cell-busy": Kind(409, 2001, "Another scan is active", True, "Wait for the active scan, or stop it."),
+        "calibration": Kind(422, 1107, "The calibration cannot be made or used", False, "Follow what the detail says."),
+        "cell-busy": Kind(409, 2001, "Another scan or job is active", True, "Wait for it to end, or stop it."),
         "not-ready": Kind(503, 2002, "The cell is not ready", True, "See the reasons; check the devices."),
         "detection": Kind(500, 3001, "The template matcher could not answer", False, "Report it with the scan's id."),
         "matcher-died": Kind(500, 3002, "The template matcher died or hung", True, "Start the scan again."),
@@ -79,6 +80,7 @@ KIND_OF_ERROR: Mapping[type[BaseException], str] = MappingProxyType(
         errors.DepthError: "depth",
         errors.PoseError: "pose",
         errors.MeshError: "mesh",
+        errors.CalibrationError: "calibration",
         errors.InputError: "validation",
         errors.MatcherDiedError: "matcher-died",
         errors.DetectionError: "detection",
@@ -117,8 +119,8 @@ class Problem(BaseModel):
         Whether the same request may succeed later, unchanged.
     operator_action
         What a person at the cell does next.
-    scan_id, device, errors, reasons
-        The scan, device, fields or conditions it is about, where there are any.
+    scan_id, job_id, device, errors, reasons
+        The scan, job, device, fields or conditions it is about, where there are any.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -131,6 +133,7 @@ class Problem(BaseModel):
     retryable: bool
     operator_action: str
     scan_id: str | None = None
+    job_id: str | None = None
     device: str | None = None
     errors: tuple[FieldProblem, ...] | None = None
     reasons: tuple[str, ...] | None = None

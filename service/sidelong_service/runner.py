@@ -146,6 +146,11 @@ class WatchedCamera:
         return self._camera.name
 
     @property
+    def serial(self) -> str:
+        """Serial number of the device."""
+        return self._camera.serial
+
+    @property
     def rig(self) -> StereoRig:
         """Intrinsics, baseline and projector."""
         return self._camera.rig

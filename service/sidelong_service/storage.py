@@ -1,7 +1,7 @@
-"""What outlives the service: scans, their events and the names of their files, in one SQLite database.
+"""What outlives the service: scans and jobs, their events and the names of their files, in one SQLite database.
 
-One connection, owned by one thread. Events are the truth about a scan's course; the row of a scan holds its present
-state. The files themselves lie in ``<data_dir>/scans/<id>/``.
+One connection, owned by one thread. Both are runs: a row holds the present state, events are the truth about the
+course. The files of a scan lie in ``<data_dir>/scans/<id>/``.
 """
 
 from __future__ import annotations
@@ -17,12 +17,17 @@ from typing import Any
 from sidelong.types import Stop
 from sidelong_service.models import (
     Artifact,
+    CalibrationJob,
+    CalibrationRequest,
     EventKind,
+    JobEvent,
+    JobList,
+    RunKind,
+    RunState,
     Scan,
     ScanEvent,
     ScanList,
     ScanRequest,
-    ScanState,
     ScanSummary,
     Setup,
     ViewReport,
@@ -46,10 +51,17 @@ MIGRATIONS = (
         size_bytes INTEGER NOT NULL, sha256 TEXT NOT NULL, PRIMARY KEY (scan, name)
     ) STRICT;
     """,
+    # jobs go the way of scans
+    """
+    ALTER TABLE scans RENAME TO runs;
+    ALTER TABLE runs ADD COLUMN kind TEXT NOT NULL DEFAULT 'scan';
+    ALTER TABLE events RENAME COLUMN scan TO run;
+    ALTER TABLE artifacts RENAME COLUMN scan TO run;
+    """,
 )
 """Applied in order; ``user_version`` counts those a database has had."""
 
-_OPEN_STATES = tuple(state.value for state in ScanState if not state.ended)
+_OPEN_STATES = tuple(state.value for state in RunState if not state.ended)
 
 
 def utc_now() -> datetime:
@@ -92,66 +104,67 @@ class Storage:
         """Close the database."""
         self._db.close()
 
-    def create(self, scan_id: str, request: ScanRequest) -> None:
-        """Add an accepted scan."""
+    def create(self, run_id: str, request: ScanRequest | CalibrationRequest) -> None:
+        """Add an accepted scan or job."""
+        kind = RunKind.SCAN if isinstance(request, ScanRequest) else RunKind.CALIBRATION
         with self._transaction():
             self._db.execute(
-                "INSERT INTO scans (id, state, request, created_at) VALUES (?, ?, ?, ?)",
-                (scan_id, ScanState.ACCEPTED, request.model_dump_json(), self._stamp()),
+                "INSERT INTO runs (id, kind, state, request, created_at) VALUES (?, ?, ?, ?, ?)",
+                (run_id, kind, RunState.ACCEPTED, request.model_dump_json(), self._stamp()),
             )
-            self._add_event(scan_id, "state", {"state": ScanState.ACCEPTED})
+            self._add_event(run_id, "state", {"state": RunState.ACCEPTED})
 
     def set_state(
-        self, scan_id: str, state: ScanState, finish_reason: Stop | None = None, trouble: Problem | None = None
+        self, run_id: str, state: RunState, finish_reason: Stop | None = None, trouble: Problem | None = None
     ) -> None:
-        """Change the state of a scan; an ended scan stays as it is."""
+        """Change the state of a run; an ended one stays as it is."""
         with self._transaction():
-            row = self._row(scan_id)
-            if row is None or ScanState(row["state"]).ended:
+            row = self._row(run_id)
+            if row is None or RunState(row["state"]).ended:
                 return
             document = None if trouble is None else trouble.model_dump_json(exclude_none=True)
             self._db.execute(
-                "UPDATE scans SET state = ?, finish_reason = ?, problem = ?, started_at = ?, ended_at = ?, phase = ? "
+                "UPDATE runs SET state = ?, finish_reason = ?, problem = ?, started_at = ?, ended_at = ?, phase = ? "
                 "WHERE id = ?",
                 (
                     state,
                     finish_reason,
                     document,
-                    row["started_at"] or (self._stamp() if state is ScanState.RUNNING else None),
+                    row["started_at"] or (self._stamp() if state is RunState.RUNNING else None),
                     self._stamp() if state.ended else None,
                     None if state.ended else row["phase"],
-                    scan_id,
+                    run_id,
                 ),
             )
             data = {"state": state, "finish_reason": finish_reason, "problem": document and json.loads(document)}
-            self._add_event(scan_id, "state", data)
+            self._add_event(run_id, "state", data)
 
-    def add_event(self, scan_id: str, kind: EventKind, data: Mapping[str, Any]) -> None:
+    def add_event(self, run_id: str, kind: EventKind, data: Mapping[str, Any]) -> None:
         """Add an event; a phase and an artifact enter their tables too."""
         with self._transaction():
             if kind == "phase":
-                self._db.execute("UPDATE scans SET phase = ? WHERE id = ?", (data["phase"], scan_id))
+                self._db.execute("UPDATE runs SET phase = ? WHERE id = ?", (data["phase"], run_id))
             if kind == "artifact":
                 self._db.execute(
-                    "INSERT OR REPLACE INTO artifacts (scan, name, media_type, size_bytes, sha256) "
-                    "VALUES (:scan, :name, :media_type, :size_bytes, :sha256)",
-                    {"scan": scan_id, **data},
+                    "INSERT OR REPLACE INTO artifacts (run, name, media_type, size_bytes, sha256) "
+                    "VALUES (:run, :name, :media_type, :size_bytes, :sha256)",
+                    {"run": run_id, **data},
                 )
-            self._add_event(scan_id, kind, data)
+            self._add_event(run_id, kind, data)
 
-    def interrupt_open_scans(self) -> int:
-        """Mark scans that a former service left open as interrupted, and return how many there were."""
-        query = f"SELECT id FROM scans WHERE state IN ({','.join('?' * len(_OPEN_STATES))})"
+    def interrupt_open_runs(self) -> int:
+        """Mark runs that a former service left open as interrupted, and return how many there were."""
+        query = f"SELECT id FROM runs WHERE state IN ({','.join('?' * len(_OPEN_STATES))})"
         left = [str(row["id"]) for row in self._db.execute(query, _OPEN_STATES)]
-        for scan_id in left:
-            trouble = problem("service-restarted", "The service ended while this scan was active.", scan_id=scan_id)
-            self.set_state(scan_id, ScanState.INTERRUPTED, trouble=trouble)
+        for run_id in left:
+            trouble = problem("service-restarted", "The service ended while this was active.", scan_id=run_id)
+            self.set_state(run_id, RunState.INTERRUPTED, trouble=trouble)
         return len(left)
 
     def scan(self, scan_id: str) -> Scan | None:
         """Return a scan with all it knows, None where there is none."""
         row = self._row(scan_id)
-        if row is None:
+        if row is None or row["kind"] != RunKind.SCAN:
             return None
         request = ScanRequest.model_validate_json(row["request"])
         setups = [Setup.model_validate(event.data) for event in self.events(scan_id, kind="setup")]
@@ -164,35 +177,63 @@ class Storage:
             artifacts=self.artifacts(scan_id),
         )
 
-    def has_ended(self, scan_id: str) -> bool:
-        """Say whether nothing more happens to a scan; true where there is none."""
-        row = self._row(scan_id)
-        return row is None or ScanState(row["state"]).ended
+    def job(self, job_id: str) -> CalibrationJob | None:
+        """Return a calibration job with all it knows, None where there is none."""
+        row = self._row(job_id)
+        return None if row is None or row["kind"] != RunKind.CALIBRATION else self._job(row)
+
+    def has_ended(self, run_id: str) -> bool:
+        """Say whether nothing more happens to a run; true where there is none."""
+        row = self._row(run_id)
+        return row is None or RunState(row["state"]).ended
 
     def scans(self, limit: int, before: int | None = None) -> ScanList:
         """Return the newest scans, or those before a cursor."""
-        query = "SELECT * FROM scans WHERE seq < ? ORDER BY seq DESC LIMIT ?"
-        rows = self._db.execute(query, (before if before is not None else 2**63 - 1, limit + 1)).fetchall()
-        summaries = [_summary(row, ScanRequest.model_validate_json(row["request"])) for row in rows[:limit]]
-        return ScanList(scans=tuple(summaries), next_cursor=rows[limit - 1]["seq"] if len(rows) > limit else None)
+        rows, cursor = self._newest(RunKind.SCAN, limit, before)
+        summaries = [_summary(row, ScanRequest.model_validate_json(row["request"])) for row in rows]
+        return ScanList(scans=tuple(summaries), next_cursor=cursor)
 
-    def events(self, scan_id: str, after: int = 0, kind: EventKind | None = None) -> list[ScanEvent]:
-        """Return the events of a scan after the given one, oldest first."""
-        query = "SELECT * FROM events WHERE scan = ? AND id > ? AND kind = coalesce(?, kind) ORDER BY id"
-        return [_event(row) for row in self._db.execute(query, (scan_id, after, kind))]
+    def jobs(self, limit: int, before: int | None = None) -> JobList:
+        """Return the newest calibration jobs, or those before a cursor."""
+        rows, cursor = self._newest(RunKind.CALIBRATION, limit, before)
+        return JobList(jobs=tuple(self._job(row) for row in rows), next_cursor=cursor)
+
+    def events(self, run_id: str, after: int = 0, kind: EventKind | None = None) -> list[ScanEvent | JobEvent]:
+        """Return the events of a run after the given one, oldest first."""
+        query = (
+            "SELECT events.*, runs.kind AS owner FROM events JOIN runs ON runs.id = events.run "
+            "WHERE run = ? AND events.id > ? AND events.kind = coalesce(?, events.kind) ORDER BY events.id"
+        )
+        return [_event(row) for row in self._db.execute(query, (run_id, after, kind))]
 
     def artifacts(self, scan_id: str) -> tuple[Artifact, ...]:
         """Return the files of a scan, in the order they were made."""
-        rows = self._db.execute("SELECT * FROM artifacts WHERE scan = ? ORDER BY rowid", (scan_id,))
+        rows = self._db.execute("SELECT * FROM artifacts WHERE run = ? ORDER BY rowid", (scan_id,))
         return tuple(Artifact.model_validate({key: row[key] for key in Artifact.model_fields}) for row in rows)
 
-    def _row(self, scan_id: str) -> sqlite3.Row | None:
-        return self._db.execute("SELECT * FROM scans WHERE id = ?", (scan_id,)).fetchone()
+    def _row(self, run_id: str) -> sqlite3.Row | None:
+        return self._db.execute("SELECT * FROM runs WHERE id = ?", (run_id,)).fetchone()
 
-    def _add_event(self, scan_id: str, kind: EventKind, data: Mapping[str, Any]) -> None:
+    def _newest(self, kind: RunKind, limit: int, before: int | None) -> tuple[list[sqlite3.Row], int | None]:
+        """Return the newest runs of a kind before a cursor, and the cursor of older ones."""
+        query = "SELECT * FROM runs WHERE kind = ? AND seq < ? ORDER BY seq DESC LIMIT ?"
+        rows = self._db.execute(query, (kind, before if before is not None else 2**63 - 1, limit + 1)).fetchall()
+        return rows[:limit], rows[limit - 1]["seq"] if len(rows) > limit else None
+
+    def _job(self, row: sqlite3.Row) -> CalibrationJob:
+        request = CalibrationRequest.model_validate_json(row["request"])
+        columns = ("id", "state", "phase", "created_at", "started_at", "ended_at")
+        return CalibrationJob(
+            **{name: row[name] for name in columns},
+            request=request.model_dump(mode="json"),
+            problem=Problem.model_validate_json(row["problem"]) if row["problem"] else None,
+            calibrations=tuple(event.data["id"] for event in self.events(row["id"], kind="calibration")),
+        )
+
+    def _add_event(self, run_id: str, kind: EventKind, data: Mapping[str, Any]) -> None:
         given = json.dumps({key: value for key, value in data.items() if value is not None}, allow_nan=False)
         self._db.execute(
-            "INSERT INTO events (scan, kind, at, data) VALUES (?, ?, ?, ?)", (scan_id, kind, self._stamp(), given)
+            "INSERT INTO events (run, kind, at, data) VALUES (?, ?, ?, ?)", (run_id, kind, self._stamp(), given)
         )
 
     def _stamp(self) -> str:
@@ -222,7 +263,8 @@ def _summary(row: sqlite3.Row, request: ScanRequest) -> ScanSummary:
     return ScanSummary.model_validate({**values, "part": request.part, "recording": request.recording})
 
 
-def _event(row: sqlite3.Row) -> ScanEvent:
-    return ScanEvent.model_validate(
-        {**{key: row[key] for key in ("id", "scan", "kind", "at")}, "data": json.loads(row["data"])}
-    )
+def _event(row: sqlite3.Row) -> ScanEvent | JobEvent:
+    about = {**{key: row[key] for key in ("id", "kind", "at")}, "data": json.loads(row["data"])}
+    if row["owner"] == RunKind.SCAN:
+        return ScanEvent.model_validate(about | {"scan": row["run"]})
+    return JobEvent.model_validate(about | {"job": row["run"]})

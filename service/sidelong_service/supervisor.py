@@ -1,4 +1,4 @@
-"""The cell: its processes, the one scan that may be active, and the stop."""
+"""The cell: its processes, the one scan or job that may be active, and the stop."""
 
 from __future__ import annotations
 
@@ -13,11 +13,25 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from sidelong.errors import SidelongError
 from sidelong.types import Stop
+from sidelong_service.calibration_store import CalibrationStore
 from sidelong_service.children import ArmLink, ChildGoneError, WorkerLink
 from sidelong_service.events import Bulletin
-from sidelong_service.messages import CellJob, CheckJob, Job, Note, RecordingJob, RunJob
-from sidelong_service.models import CellReport, CellState, Readiness, ScanRequest, ScanState
+from sidelong_service.jobs import job_of
+from sidelong_service.messages import (
+    CalibrateJob,
+    CapturesJob,
+    CellJob,
+    CheckJob,
+    Job,
+    Note,
+    RecordingJob,
+    RunJob,
+    ScanJob,
+    Settings,
+)
+from sidelong_service.models import CalibrationRequest, CellReport, CellState, Readiness, RunState, ScanRequest
 from sidelong_service.problems import Problem, ServiceError, problem, problem_of
 from sidelong_service.settings import ServiceSettings
 from sidelong_service.storage import Storage
@@ -36,41 +50,66 @@ STORE_ATTEMPTS, STORE_AGAIN_S = 6, 1.0
 
 
 @dataclass(eq=False)
-class ActiveScan:
-    """The scan that has the cell."""
+class ActiveRun:
+    """The scan or job that has the worker."""
 
     id: str
-    request: ScanRequest
+    request: ScanRequest | CalibrationRequest
     job: Job
+    settings: Settings
     accepted: bool = False
     stop_asked: bool = False
+
+    @property
+    def is_scan(self) -> bool:
+        """Whether it is a scan, which has the cell too."""
+        return isinstance(self.request, ScanRequest)
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+        return f"{'scan' if self.is_scan else 'job'} {self.id}"
+
+    @property
+    def reference(self) -> dict[str, str]:
+        """The member of a problem document that names it."""
+        return {"scan_id" if self.is_scan else "job_id": self.id}
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a scan ended."""
+    """How a run ended."""
 
-    state: ScanState
+    state: RunState
     finish_reason: Stop | None = None
     problem: Problem | None = None
 
 
 class Supervisor:
-    """Owns arm host and scan worker, starts them again when they die, and runs one scan at a time.
+    """Owns arm host and scan worker, starts them again when they die, and runs one scan or job at a time.
 
     Parameters
     ----------
     settings
         Of the service.
     storage
-        Where scans are kept.
+        Where scans and jobs are kept.
+    calibrations
+        Where calibrations are kept.
     new_id
-        Makes ids of scans.
+        Makes ids of scans and jobs.
     """
 
-    def __init__(self, settings: ServiceSettings, storage: StorageThread, new_id: Callable[[], str]) -> None:
+    def __init__(
+        self,
+        settings: ServiceSettings,
+        storage: StorageThread,
+        calibrations: CalibrationStore,
+        new_id: Callable[[], str],
+    ) -> None:
         self._settings = settings
         self._storage = storage
+        self._calibrations = calibrations
         self._new_id = new_id
         self._sockets = Path()
         self._socket_numbers = count()
@@ -80,7 +119,7 @@ class Supervisor:
         self._arm_trouble = "is starting"
         self._worker: WorkerLink | None = None
         self._worker_trouble = "is starting"
-        self._active: ActiveScan | None = None
+        self._active: ActiveRun | None = None
         self._entrance = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
         self._keepers: list[asyncio.Task[None]] = []
@@ -88,22 +127,22 @@ class Supervisor:
         self.bulletin = Bulletin()
 
     async def start(self) -> None:
-        """Start the processes; scans that a former service left open are marked as interrupted."""
-        left = await self._storage.call(Storage.interrupt_open_scans)
+        """Start the processes; runs that a former service left open are marked as interrupted."""
+        left = await self._storage.call(Storage.interrupt_open_runs)
         if left:
-            log.warning("%d scans were interrupted when the service last ended", left)
+            log.warning("%d scans or jobs were interrupted when the service last ended", left)
         self._sockets = Path(tempfile.mkdtemp(prefix="sidelong-"))
         self._keepers = [asyncio.create_task(self._keep_arm()), asyncio.create_task(self._keep_worker())]
 
     def begin_closing(self) -> None:
-        """Stop the arm and the active scan, take no other, and end the event streams. Harmless when repeated."""
+        """Stop the arm and the active run, take no other, and end the event streams. Harmless when repeated."""
         if not self._closing:
             self._closing = True
             self._spawn(self._stop_quietly())
             self.bulletin.close()
 
     async def close(self) -> None:
-        """Stop the arm, then end the active scan and the processes."""
+        """Stop the arm, then end the active run and the processes."""
         self.begin_closing()
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=CLOSING_S)
@@ -114,40 +153,49 @@ class Supervisor:
         await asyncio.gather(*self._keepers, *self._tasks, return_exceptions=True)
         shutil.rmtree(self._sockets, ignore_errors=True)
 
-    async def submit(self, request: ScanRequest) -> str:
-        """Accept a scan and return its id.
+    async def submit(self, request: ScanRequest | CalibrationRequest) -> str:
+        """Accept a scan or a job and return its id.
 
         Raises
         ------
         ServiceError
-            Another scan is active, the cell is not ready, or the request names what is not there.
+            Another one is active, the cell is not ready, or the request names what is not there.
         """
         # whoever comes while another request is checked waits for that: it may be refused, and its id never be a scan's
         async with self._entrance:
             return await self._admit(request)
 
-    async def _admit(self, request: ScanRequest) -> str:
+    async def _admit(self, request: ScanRequest | CalibrationRequest) -> str:
         if self._active is not None:
-            raise ServiceError(
-                problem("cell-busy", f"Scan {self._active.id} is active.", scan_id=self._active.id)
-            )  # fmt: skip
-        job = self._job(request)
+            busy = self._active
+            raise ServiceError(problem("cell-busy", f"{busy.name.capitalize()} is active.", **busy.reference))
+        try:
+            job = job_of(request, self._settings)
+            documents = await asyncio.to_thread(self._calibrations.read_all, request.recipe.calibrations)
+        except SidelongError as error:
+            raise ServiceError(problem_of(error)) from error
         reasons = self._hindrances(job)
         if reasons:
             raise ServiceError(problem("not-ready", "; ".join(reasons) + ".", reasons=reasons))
-        scan = self._active = ActiveScan(self._new_id(), request, job)
+        settings = Settings(recipe=request.recipe, documents=documents)
+        run = self._active = ActiveRun(self._new_id(), request, job, settings)
         try:
-            await self._check(scan)
-            await self._storage.call(Storage.create, scan.id, request)
-            scan.accepted = True
+            await self._check(run)
+            await self._storage.call(Storage.create, run.id, request)
+            run.accepted = True
         except BaseException:
             self._active = None
             raise
-        self._spawn(self._conduct(scan))
-        return scan.id
+        self._spawn(self._conduct(run))
+        return run.id
+
+    def cancel(self, job_id: str) -> None:
+        """Ask a job to end; one that is not active, or a scan, stays as it is."""
+        if self._active is not None and self._active.id == job_id and not self._active.is_scan:
+            self._end_early(self._active)
 
     async def stop(self) -> str | None:
-        """Stop the arm and the active scan, and return its id.
+        """Stop the arm and the active run, and return the id of a scan.
 
         No lock, queue or database stands before the message to the arm.
 
@@ -156,32 +204,33 @@ class Supervisor:
         ServiceError
             The arm did not confirm in time.
         """
-        scan = self._active
+        run = self._active
         stops = [link.stop() for link in (self._arm, self._guest_arm) if link is not None]
-        if scan is not None:
-            self._end_early(scan)
+        if run is not None:
+            self._end_early(run)
+        scan_id = run.id if run is not None and run.is_scan else None
         confirmed = await asyncio.gather(*stops)
         if self._arm is None or not all(confirmed):
-            scan_id = scan.id if scan is not None else None
             raise ServiceError(
                 problem("stop-unconfirmed", f"Arm {self._arm_name} did not confirm that it stops.", scan_id=scan_id)
             )
-        return scan.id if scan is not None else None
+        return scan_id
 
     def cell(self) -> CellReport:
         """Report on the cell."""
         cell = self._settings.cell
         reasons = self._hindrances(None)
-        active = self._active.id if self._active is not None and self._active.accepted else None
+        active = self._active if self._active is not None and self._active.accepted else None
         if self._active is not None:
-            reasons = (f"scan {active} is active" if active else "a request is being checked", *reasons)
+            reasons = (f"{active.name} is active" if active else "a request is being checked", *reasons)
         return CellReport(
             name=cell.name,
             mode="simulated" if cell.simulated else "real",
             state=self._state(),
             camera=cell.camera.driver,
             arm=self._arm_name,
-            active_scan=active,
+            active_scan=active.id if active is not None and active.is_scan else None,
+            active_job=active.id if active is not None and not active.is_scan else None,
             may_start=not reasons,
             reasons=reasons,
         )
@@ -205,34 +254,20 @@ class Supervisor:
         return CellState.STARTING if set(troubles) == {"is starting"} else CellState.FAULT
 
     def _hindrances(self, job: Job | None) -> tuple[str, ...]:
-        """Say what keeps a job from starting; recorded views need no arm of the cell."""
+        """Say what keeps a job from starting; what was recorded needs no arm of the cell."""
         reasons = ["the service is ending"] if self._closing else []
-        if self._arm_trouble and not isinstance(job, RecordingJob):
+        if self._arm_trouble and not isinstance(job, RecordingJob | CapturesJob):
             reasons.append(f"arm {self._arm_name}: {self._arm_trouble}")
         if self._worker_trouble:
             reasons.append(f"scan worker: {self._worker_trouble}")
         return tuple(reasons)
 
-    def _job(self, request: ScanRequest) -> Job:
-        recording = request.recording
-        if recording is None:
-            return CellJob(cell=self._settings.cell, part=request.part or "")
-        root = self._settings.datasets.get(recording.dataset)
-        if root is None:
-            known = ", ".join(sorted(self._settings.datasets)) or "none"
-            raise ServiceError(
-                problem("unknown-name", f"dataset: {recording.dataset!r} is unknown, known are {known}")
-            )  # fmt: skip
-        return RecordingJob(
-            root=root.resolve(), object=recording.object, scene=recording.scene, reference=recording.reference
-        )
-
-    async def _check(self, scan: ActiveScan) -> None:
+    async def _check(self, run: ActiveRun) -> None:
         worker = self._worker
         try:
             if worker is None:
                 raise ChildGoneError("the scan worker has gone")
-            trouble = await worker.check(CheckJob(job=scan.job, recipe=scan.request.recipe))
+            trouble = await worker.check(CheckJob(job=run.job, settings=run.settings))
         except ChildGoneError as error:
             if worker is not None:
                 worker.kill()
@@ -242,59 +277,60 @@ class Supervisor:
         if trouble is not None:
             raise ServiceError(trouble)
 
-    async def _conduct(self, scan: ActiveScan) -> None:
-        """See a scan through to its end, whatever happens."""
+    async def _conduct(self, run: ActiveRun) -> None:
+        """See a run through to its end, whatever happens."""
         try:
-            ending = await self._run(scan)
+            ending = await (self._scan(run) if run.is_scan else self._calibrate(run))
         except ServiceError as error:
-            ending = Ending(ScanState.FAILED, problem=error.problem)
+            ending = Ending(RunState.FAILED, problem=error.problem)
         except Exception as error:
-            log.exception("scan %s", scan.id)
-            ending = Ending(ScanState.FAILED, problem=problem_of(error))
+            log.exception("%s", run.name)
+            ending = Ending(RunState.FAILED, problem=problem_of(error))
         try:
-            await self._end(scan.id, self._judge(scan, ending))
+            await self._end(run, self._judge(run, ending))
         finally:
             self._active = None
             self.bulletin.post()
 
-    async def _end(self, scan_id: str, ending: Ending) -> None:
-        """Keep how a scan ended, also where the database is not to be had for a while."""
+    async def _end(self, run: ActiveRun, ending: Ending) -> None:
+        """Keep how a run ended, also where the database is not to be had for a while."""
         for attempt in range(1, STORE_ATTEMPTS + 1):
             try:
-                await self._set_state(scan_id, ending)
+                await self._set_state(run.id, ending)
             except sqlite3.Error as error:
-                log.error("scan %s: its end, %s, is not stored: %s", scan_id, ending.state, error)
+                log.error("%s: its end, %s, is not stored: %s", run.name, ending.state, error)
                 if self._closing or attempt == STORE_ATTEMPTS:
                     raise
                 await asyncio.sleep(STORE_AGAIN_S)
             else:
                 return
 
-    def _judge(self, scan: ActiveScan, ending: Ending) -> Ending:
-        """Say how a scan ended: one that was stopped did not fail, whatever error the stop brought about."""
-        if ending.state is ScanState.SUCCEEDED:
+    def _judge(self, run: ActiveRun, ending: Ending) -> Ending:
+        """Say how a run ended: one that was stopped did not fail, whatever error the stop brought about."""
+        if ending.state is RunState.SUCCEEDED:
             return ending
         if self._closing:
-            trouble = problem("service-restarted", "The service ended during the scan.", scan_id=scan.id)
-            return Ending(ScanState.INTERRUPTED, problem=trouble)
-        return Ending(ScanState.STOPPED) if scan.stop_asked else ending
+            trouble = problem("service-restarted", f"The service ended during {run.name}.", **run.reference)
+            return Ending(RunState.INTERRUPTED, problem=trouble)
+        return Ending(RunState.STOPPED) if run.stop_asked else ending
 
-    async def _run(self, scan: ActiveScan) -> Ending:
+    async def _scan(self, run: ActiveRun) -> Ending:
+        job = run.job
+        if isinstance(job, CapturesJob):
+            raise TypeError(f"{run.name} is no scan")
         async with contextlib.AsyncExitStack() as stack:
-            arm, name = await self._arm_for(scan.job, stack)
-            worker = self._worker
-            if worker is None:
-                raise ServiceError(problem("worker-died", "The scan worker ended before the scan began."))
-            await self._set_state(scan.id, Ending(ScanState.RUNNING))
-            # from here to the job no await: a stop comes either before, and is seen, or after, and finds both at work
-            if scan.stop_asked:
-                return Ending(ScanState.STOPPED)
+            arm, name = await self._arm_for(job, stack)
+            worker = await self._begin(run)
+            # from the state to the job no await: a stop comes either before, and is seen, or after, and finds both at
+            # work
+            if run.stop_asked:
+                return Ending(RunState.STOPPED)
             arm.release()
-            folder, cache = self._settings.data_dir / "scans" / scan.id, self._settings.data_dir / "templates"
+            folder, cache = self._settings.data_dir / "scans" / run.id, self._settings.data_dir / "templates"
             worker.run(
                 RunJob(
-                    job=scan.job,
-                    recipe=scan.request.recipe,
+                    job=job,
+                    settings=run.settings,
                     arm_socket=arm.path,
                     arm_name=name,
                     folder=folder.resolve(),
@@ -302,31 +338,53 @@ class Supervisor:
                 )
             )
             try:
-                return await self._follow(scan, worker)
-            except ChildGoneError:
-                await arm.stop()
-                trouble = problem("worker-died", "The scan worker ended during the scan.", scan_id=scan.id)
-                return Ending(ScanState.INTERRUPTED, problem=trouble)
+                ending = await self._follow(run, worker)
             except Exception:
-                # nobody follows the worker any more: it may not go on, and the arm may not go on moving
-                worker.kill()
+                # nobody follows the worker any more: the arm may not go on moving
                 await arm.stop()
                 raise
+            if ending.state is RunState.INTERRUPTED:
+                await arm.stop()
+            return ending
 
-    async def _follow(self, scan: ActiveScan, worker: WorkerLink) -> Ending:
-        """Keep what the worker tells until it is done."""
-        while True:
-            message = await worker.next()
-            if isinstance(message, Note):
-                await self._storage.call(Storage.add_event, scan.id, message.event, message.data)
-                self.bulletin.post()
-            elif message.kind == "done":
-                if message.finish_reason is not None:
-                    return Ending(ScanState.SUCCEEDED, message.finish_reason)
-                state = ScanState.STOPPED if message.problem is None else ScanState.FAILED
-                return Ending(state, problem=message.problem)
+    async def _calibrate(self, run: ActiveRun) -> Ending:
+        job = run.job
+        if not isinstance(job, CapturesJob):
+            raise TypeError(f"{run.name} is no calibration")
+        worker = await self._begin(run)
+        if run.stop_asked:
+            return Ending(RunState.STOPPED)
+        worker.run(CalibrateJob(job=job, settings=run.settings, folder=self._calibrations.folder.resolve()))
+        return await self._follow(run, worker)
 
-    async def _arm_for(self, job: Job, stack: contextlib.AsyncExitStack) -> tuple[ArmLink, str]:
+    async def _begin(self, run: ActiveRun) -> WorkerLink:
+        """Mark a run as running, and return the worker that shall do it."""
+        worker = self._worker
+        if worker is None:
+            raise ServiceError(problem("worker-died", f"The scan worker ended before {run.name} began."))
+        await self._set_state(run.id, Ending(RunState.RUNNING))
+        return worker
+
+    async def _follow(self, run: ActiveRun, worker: WorkerLink) -> Ending:
+        """Keep what the worker tells until it is done; where that fails the worker may not go on."""
+        try:
+            while True:
+                message = await worker.next()
+                if isinstance(message, Note):
+                    await self._storage.call(Storage.add_event, run.id, message.event, message.data)
+                    self.bulletin.post()
+                elif message.kind == "done":
+                    state = RunState.STOPPED if message.cancelled else RunState.SUCCEEDED
+                    state = state if message.problem is None else RunState.FAILED
+                    return Ending(state, message.finish_reason, message.problem)
+        except ChildGoneError:
+            trouble = problem("worker-died", f"The scan worker ended during {run.name}.", **run.reference)
+            return Ending(RunState.INTERRUPTED, problem=trouble)
+        except Exception:
+            worker.kill()
+            raise
+
+    async def _arm_for(self, job: ScanJob, stack: contextlib.AsyncExitStack) -> tuple[ArmLink, str]:
         """Return the arm of a job and its name: the cell's, or for recorded views one for this scan alone."""
         if isinstance(job, CellJob):
             if self._arm is None:
@@ -340,19 +398,19 @@ class Supervisor:
         self._guest_arm = None
         await guest.close()
 
-    def _end_early(self, scan: ActiveScan) -> None:
-        """Ask for the end of a scan, once; kill its worker where it does not come."""
-        if scan.stop_asked:
+    def _end_early(self, run: ActiveRun) -> None:
+        """Ask for the end of a run, once; kill its worker where it does not come."""
+        if run.stop_asked:
             return
-        scan.stop_asked = True
+        run.stop_asked = True
         if self._worker is not None:
             self._worker.cancel()
-            asyncio.get_running_loop().call_later(STOPPING_S, self._kill_if_active, scan, self._worker)
-        self._spawn(self._set_state(scan.id, Ending(ScanState.STOPPING)))
+            asyncio.get_running_loop().call_later(STOPPING_S, self._kill_if_active, run, self._worker)
+        self._spawn(self._set_state(run.id, Ending(RunState.STOPPING)))
 
-    def _kill_if_active(self, scan: ActiveScan, worker: WorkerLink) -> None:
-        if self._active is scan:
-            log.error("scan %s did not end within %g s of the stop: its worker is killed", scan.id, STOPPING_S)
+    def _kill_if_active(self, run: ActiveRun, worker: WorkerLink) -> None:
+        if self._active is run:
+            log.error("%s did not end within %g s of the stop: its worker is killed", run.name, STOPPING_S)
             worker.kill()
 
     async def _stop_quietly(self) -> None:
@@ -361,8 +419,8 @@ class Supervisor:
         except ServiceError as error:
             log.error("while the service ends: %s", error)
 
-    async def _set_state(self, scan_id: str, ending: Ending) -> None:
-        await self._storage.call(Storage.set_state, scan_id, ending.state, ending.finish_reason, ending.problem)
+    async def _set_state(self, run_id: str, ending: Ending) -> None:
+        await self._storage.call(Storage.set_state, run_id, ending.state, ending.finish_reason, ending.problem)
         self.bulletin.post()
 
     async def _keep_arm(self) -> None:

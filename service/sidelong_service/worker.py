@@ -16,10 +16,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from sidelong.errors import DeviceError, SidelongError
-from sidelong_service.cells import Cameras, cell_of, effective_recipe, plan_of
+from sidelong_service.calibrating import CalibrationRun
+from sidelong_service.calibration_store import CalibrationStore
+from sidelong_service.cells import Cameras, cell_of, check, effective_recipe, plan_of
 from sidelong_service.lines import Lines
 from sidelong_service.messages import (
     TO_WORKER,
+    CalibrateJob,
     CancelJob,
     CheckJob,
     JobChecked,
@@ -41,7 +44,7 @@ class Worker:
 
     def __init__(self, control: Lines) -> None:
         self._control = control
-        self._jobs: queue.Queue[CheckJob | RunJob] = queue.Queue()
+        self._jobs: queue.Queue[CheckJob | RunJob | CalibrateJob] = queue.Queue()
         self._cancelled = threading.Event()
         self._cameras = Cameras()
 
@@ -51,15 +54,14 @@ class Worker:
         _warm_up()
         self._control.send(WorkerReady())
         while True:
-            job = self._jobs.get()
-            self._control.send(self._check(job) if isinstance(job, CheckJob) else self._run(job))
+            self._control.send(self._do(self._jobs.get()))
 
     def note(self, kind: EventKind, data: Mapping[str, Any]) -> None:
         """Tell the API what happened."""
         self._control.send(Note(event=kind, data=dict(data)))
 
     def check_cancelled(self) -> None:
-        """Raise Cancelled where the API asked for the end of the scan."""
+        """Raise Cancelled where the API asked for the end of the job."""
         if self._cancelled.is_set():
             raise Cancelled
 
@@ -76,9 +78,18 @@ class Worker:
             self._cancelled.clear()
             self._jobs.put(message)
 
+    def _do(self, job: CheckJob | RunJob | CalibrateJob) -> JobChecked | JobDone:
+        match job:
+            case CheckJob():
+                return self._check(job)
+            case RunJob():
+                return self._run(job)
+            case CalibrateJob():
+                return self._calibrate(job)
+
     def _check(self, job: CheckJob) -> JobChecked:
         try:
-            plan_of(job.job, job.recipe)
+            check(job.job, job.settings)
         except Exception as error:  # noqa: BLE001 - told to the API, and logged where unexpected
             return JobChecked(problem=_problem_of(error))
         return JobChecked(problem=None)
@@ -86,14 +97,14 @@ class Worker:
     def _run(self, job: RunJob) -> JobDone:
         arm = RemoteArm(job.arm_name, job.arm_socket)
         try:
-            plan = plan_of(job.job, job.recipe)
+            plan = plan_of(job.job, job.settings.recipe)
             camera = self._cameras.open(plan.camera)
+            recipe = effective_recipe(job.job, job.settings, plan.part, camera.serial)
             arm.open()
-            cell = cell_of(plan, camera, arm)
-            recipe = effective_recipe(job.job, job.recipe, plan.part)
+            cell = cell_of(plan, camera, arm, job.settings.documents)
             reason = ScanRun(cell, plan.part, recipe, job.folder, job.cache_dir, self).run()
         except Cancelled:
-            return JobDone()
+            return JobDone(cancelled=True)
         except Exception as error:  # noqa: BLE001 - told to the API, and logged where unexpected
             if isinstance(error, DeviceError) and error.device != arm.name:
                 self._cameras.close()
@@ -101,6 +112,15 @@ class Worker:
         finally:
             arm.close()
         return JobDone(finish_reason=reason)
+
+    def _calibrate(self, job: CalibrateJob) -> JobDone:
+        try:
+            CalibrationRun(job.job, job.settings, CalibrationStore(job.folder), self).run()
+        except Cancelled:
+            return JobDone(cancelled=True)
+        except Exception as error:  # noqa: BLE001 - told to the API, and logged where unexpected
+            return JobDone(problem=_problem_of(error))
+        return JobDone()
 
 
 def _problem_of(error: Exception) -> Problem:

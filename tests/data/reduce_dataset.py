@@ -4,7 +4,8 @@
 
 Images are averaged over 2x2 pixels. A depth is the harmonic mean of the four where they lie within 2 mm of each other
 (1/z is affine on a plane), else missing: a pixel across an edge has no depth. Images of the right camera and of the dot
-pattern are kept for the first view only.
+pattern are kept for the first view only. The exposure bracket is cut to its middle instead: means of grey levels are no
+grey levels of any light.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 import yaml
 
 SPREAD_MM = 2.0
+BRACKET_CUT = (256, 320)
 
 
 def reduce_image(source: Path, target: Path) -> None:
@@ -73,12 +75,26 @@ def main(source: Path, target: Path, name: str, views: list[str]) -> None:
                     reduce_image(path, copy)
     (target / scene / "Ensenso/list.txt").write_text("".join(f"{view}\n" for view in views))
     shutil.copy(source / scene / "GT_world2obj.json", target / scene)
-    calibration = Path(name) / "Calibration/Phong"
-    (target / calibration).mkdir(parents=True, exist_ok=True)
-    reduce_image(source / calibration / "LEFT_white.bmp", target / calibration / "LEFT_white.bmp")
-    for file in ("LEFT_white.json", "GT_world2obj.json"):
-        content = json.loads((source / calibration / file).read_text())
-        (target / calibration / file).write_text(json.dumps(content))
+    reduce_calibration(source / name / "Calibration", target / name / "Calibration", unit_mm)
+
+
+def reduce_calibration(source: Path, target: Path, unit_mm: float) -> None:
+    for kind in ("Phong", "Response"):
+        (target / kind).mkdir(parents=True, exist_ok=True)
+        for path in (source / kind).glob("*.json"):
+            (target / kind / path.name).write_text(json.dumps(json.loads(path.read_text())))
+    for side in ("LEFT", "RIGHT"):
+        reduce_image(source / f"Phong/{side}_white.bmp", target / f"Phong/{side}_white.bmp")
+    reduce_depth(source / "Phong/DEPTH_sprayed.png", target / "Phong/DEPTH_sprayed.png", unit_mm, fewest=4)
+    mask = cv2.imread(str(source / "Phong/mask_parts.png"), cv2.IMREAD_GRAYSCALE)
+    # a pixel that is a part's in part only is none of it
+    whole = np.minimum.reduce([mask[i::2, j::2] for i in (0, 1) for j in (0, 1)])
+    cv2.imwrite(str(target / "Phong/mask_parts.png"), whole)
+    for path in (source / "Response").glob("*.bmp"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        row, column = ((size - cut) // 2 for size, cut in zip(image.shape, BRACKET_CUT, strict=True))
+        cut = image[row : row + BRACKET_CUT[0], column : column + BRACKET_CUT[1]]
+        cv2.imwrite(str(target / "Response" / path.name), cut)
 
 
 if __name__ == "__main__":

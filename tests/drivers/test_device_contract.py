@@ -22,9 +22,9 @@ from sidelong.errors import (
     SettingsError,
     UnknownNameError,
 )
-from sidelong.evaluation.dataset import Dataset
 from sidelong.geometry.transforms import invert, look_at, transform, validated_transform
 from sidelong.planning.candidates import DomeSettings, dome_views
+from sidelong.recorded.dataset import Dataset
 from sidelong.types import FloatArray, Frame, Projector
 from sidelong_drivers.registry import ARMS, CAMERAS, create_arm, create_camera
 
@@ -140,6 +140,7 @@ def assert_camera_works(device: Camera, case: CameraCase) -> None:
 def assert_camera_is_closed(device: Camera, case: CameraCase) -> None:
     uses: tuple[Callable[[], object], ...] = (
         lambda: device.rig,
+        lambda: device.serial,
         lambda: device.capture(OFF, case.pose()),
         lambda: device.capture(DOTS, case.pose()),
     )
@@ -169,6 +170,15 @@ def test_a_rig_fits_its_images(driver: str, camera: Camera) -> None:
     assert (rig.left.width, rig.left.height) == (rig.right.width, rig.right.height) == (width, height)
     assert 0.01 < rig.baseline_m < 1.0
     validated_transform(rig.projector.left_T_projector, "left_T_projector")
+
+
+@camera_drivers
+def test_a_camera_has_a_serial_number_that_stays(driver: str, camera: Camera) -> None:
+    serial = camera.serial
+    assert serial.strip()
+    camera.close()
+    camera.open()
+    assert camera.serial == serial
 
 
 @camera_drivers

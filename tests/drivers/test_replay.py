@@ -12,8 +12,8 @@ import pytest
 
 from sidelong.devices import CaptureRequest
 from sidelong.errors import DatasetError, DeviceUnavailableError, ImageError, MotionRefusedError, UnknownNameError
-from sidelong.evaluation.dataset import Dataset, Scene
 from sidelong.geometry.transforms import rotation_about, transform
+from sidelong.recorded.dataset import Dataset, Scene
 from sidelong.types import FloatArray, Projector
 from sidelong_drivers.replay import ReplayArm, ReplayCamera, ReplaySettings
 

@@ -147,3 +147,16 @@ def test_an_image_that_is_not_the_sensors_is_refused_at_open():
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(ValidationError, match=next(iter(wrong))):
         small(**wrong)
+
+
+def test_spray_leaves_parts_where_they_are_and_makes_their_depth_complete() -> None:
+    empty, shiny, sprayed = small(count=0), small(), small(sprayed=True)
+    for device in (empty, shiny, sprayed):
+        device.open()
+    truth = shiny.true_depth_m(POSE)
+    np.testing.assert_array_equal(truth, sprayed.true_depth_m(POSE))
+    on_parts = truth < empty.true_depth_m(POSE) - 1e-6
+    shares = [np.isfinite(device.capture(DOTS, POSE).depth_m)[on_parts].mean() for device in (shiny, sprayed)]
+    assert shares[0] < 0.6
+    # what stays missing at this size are edges
+    assert shares[1] > 0.7

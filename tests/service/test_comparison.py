@@ -19,9 +19,9 @@ from PIL import Image
 from sidelong.errors import DatasetError, UnknownNameError
 from sidelong.evaluation.cases import Case, cases_of, truth_in
 from sidelong.evaluation.compare import Row, Run
-from sidelong.evaluation.dataset import Dataset
 from sidelong.planning.selection import StrategyName
 from sidelong.recipe import PlanningSettings, Recipe
+from sidelong.recorded.dataset import Dataset
 from sidelong_service.comparison import Comparison
 
 ROBI = Path(__file__).parents[1] / "data" / "robi"

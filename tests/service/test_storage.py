@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from sidelong.types import Stop
 from sidelong_service.events import Bulletin, follow
-from sidelong_service.models import RecordedScene, Scan, ScanRequest, ScanState
+from sidelong_service.models import RecordedScene, RunState, Scan, ScanRequest
 from sidelong_service.problems import problem
 from sidelong_service.storage import MIGRATIONS, Storage, check_database
 from sidelong_service.storage_thread import StorageThread
@@ -65,7 +65,7 @@ def known(storage: Storage, scan_id: str) -> Scan:
 def test_an_accepted_scan_is_there_with_all_its_settings(storage: Storage) -> None:
     storage.create("a", REQUEST)
     scan = known(storage, "a")
-    assert (scan.state, scan.part, scan.recording) == (ScanState.ACCEPTED, "tube_fitting", None)
+    assert (scan.state, scan.part, scan.recording) == (RunState.ACCEPTED, "tube_fitting", None)
     assert scan.created_at == START + timedelta(seconds=1)
     assert (scan.started_at, scan.ended_at, scan.phase, scan.problem, scan.setup) == (None,) * 5
     assert (scan.views, scan.artifacts) == ((), ())
@@ -80,34 +80,34 @@ def test_a_recorded_scene_comes_back_as_it_was_asked_for(storage: Storage) -> No
 
 def test_states_change_and_times_are_kept(storage: Storage) -> None:
     storage.create("a", REQUEST)
-    storage.set_state("a", ScanState.RUNNING)
+    storage.set_state("a", RunState.RUNNING)
     storage.add_event("a", "phase", {"phase": "move"})
     running = known(storage, "a")
-    assert (running.state, running.phase, running.ended_at) == (ScanState.RUNNING, "move", None)
-    storage.set_state("a", ScanState.STOPPING)
+    assert (running.state, running.phase, running.ended_at) == (RunState.RUNNING, "move", None)
+    storage.set_state("a", RunState.STOPPING)
     assert known(storage, "a").started_at == running.started_at
     assert not storage.has_ended("a")
-    storage.set_state("a", ScanState.STOPPED)
+    storage.set_state("a", RunState.STOPPED)
     stopped = known(storage, "a")
     assert stopped.created_at < (stopped.started_at or START) < (stopped.ended_at or START)
-    assert (stopped.state, stopped.phase) == (ScanState.STOPPED, None)
+    assert (stopped.state, stopped.phase) == (RunState.STOPPED, None)
     assert storage.has_ended("a")
 
 
 def test_why_a_scan_ended_is_kept(storage: Storage) -> None:
     storage.create("good", REQUEST)
     storage.create("bad", REQUEST)
-    storage.set_state("good", ScanState.SUCCEEDED, Stop.MAX_VIEWS)
+    storage.set_state("good", RunState.SUCCEEDED, Stop.MAX_VIEWS)
     trouble = problem("device-lost", "arm: gone", device="arm", scan_id="bad")
-    storage.set_state("bad", ScanState.FAILED, trouble=trouble)
+    storage.set_state("bad", RunState.FAILED, trouble=trouble)
     assert known(storage, "good").finish_reason is Stop.MAX_VIEWS
     assert known(storage, "bad").problem == trouble
     assert storage.events("bad")[-1].data["problem"]["device"] == "arm"
 
 
-@pytest.mark.parametrize("end", [state for state in ScanState if state.ended])
-@pytest.mark.parametrize("later", ScanState)
-def test_an_ended_scan_stays_as_it_ended(storage: Storage, end: ScanState, later: ScanState) -> None:
+@pytest.mark.parametrize("end", [state for state in RunState if state.ended])
+@pytest.mark.parametrize("later", RunState)
+def test_an_ended_scan_stays_as_it_ended(storage: Storage, end: RunState, later: RunState) -> None:
     storage.create("a", REQUEST)
     storage.set_state("a", end, Stop.MAX_VIEWS)
     before, events = known(storage, "a"), storage.events("a")
@@ -117,7 +117,7 @@ def test_an_ended_scan_stays_as_it_ended(storage: Storage, end: ScanState, later
 
 
 def test_what_is_told_of_an_unknown_scan_is_not_kept(storage: Storage) -> None:
-    storage.set_state("nobody", ScanState.RUNNING)
+    storage.set_state("nobody", RunState.RUNNING)
     with pytest.raises(sqlite3.IntegrityError):
         storage.add_event("nobody", "phase", {"phase": "move"})
     assert storage.scan("nobody") is None
@@ -223,31 +223,31 @@ def test_a_database_of_a_later_version_is_left_alone(file: Path) -> None:
 
 
 def test_open_scans_are_interrupted_and_ended_ones_are_not(storage: Storage) -> None:
-    states = list(ScanState)
+    states = list(RunState)
     for state in states:
         storage.create(state, REQUEST)
         storage.set_state(state, state)
         storage.add_event(state, "artifact", ARTIFACT)
-    assert storage.interrupt_open_scans() == sum(not state.ended for state in states)
+    assert storage.interrupt_open_runs() == sum(not state.ended for state in states)
     for state in states:
         scan = known(storage, state)
-        assert scan.state is (state if state.ended else ScanState.INTERRUPTED)
+        assert scan.state is (state if state.ended else RunState.INTERRUPTED)
         assert len(scan.artifacts) == 1
         if not state.ended:
             assert scan.problem is not None
             assert scan.problem.type.endswith(":service-restarted")
             assert scan.problem.scan_id == state
-    assert storage.interrupt_open_scans() == 0
+    assert storage.interrupt_open_runs() == 0
 
 
 def test_reopening_keeps_everything(file: Path) -> None:
     with closing(Storage(file, Clock())) as storage:
         storage.create("a", REQUEST)
-        storage.set_state("a", ScanState.RUNNING)
+        storage.set_state("a", RunState.RUNNING)
         storage.add_event("a", "setup", SETUP)
         storage.add_event("a", "view", VIEW)
         storage.add_event("a", "artifact", ARTIFACT)
-        storage.set_state("a", ScanState.SUCCEEDED, Stop.NOTHING_MISSING)
+        storage.set_state("a", RunState.SUCCEEDED, Stop.NOTHING_MISSING)
         before = known(storage, "a"), storage.events("a"), storage.scans(10)
     with closing(Storage(file, Clock())) as storage:
         assert (known(storage, "a"), storage.events("a"), storage.scans(10)) == before
@@ -258,9 +258,9 @@ def test_reopening_keeps_everything(file: Path) -> None:
 def test_a_process_that_never_closed_loses_nothing(file: Path) -> None:
     left_open = Storage(file, Clock())
     left_open.create("a", REQUEST)
-    left_open.set_state("a", ScanState.RUNNING)
+    left_open.set_state("a", RunState.RUNNING)
     with closing(Storage(file, Clock())) as storage:
-        assert known(storage, "a").state is ScanState.RUNNING
+        assert known(storage, "a").state is RunState.RUNNING
     left_open.close()
 
 
@@ -270,7 +270,7 @@ def test_check_makes_a_database_and_accepts_a_whole_one(file: Path) -> None:
         storage.create("a", REQUEST)
     check_database(file)
     with closing(Storage(file)) as storage:
-        assert known(storage, "a").state is ScanState.ACCEPTED
+        assert known(storage, "a").state is RunState.ACCEPTED
 
 
 def test_check_finds_what_is_no_database(file: Path) -> None:
@@ -325,7 +325,7 @@ def test_followers_hear_everything_once_and_end_with_the_scan(file: Path) -> Non
         for number in range(20):
             await thread.call(Storage.add_event, "a", "progress", {"done": number})
             bulletin.post()
-        await thread.call(Storage.set_state, "a", ScanState.STOPPED)
+        await thread.call(Storage.set_state, "a", RunState.STOPPED)
         bulletin.post()
         heard = await asyncio.gather(*listeners)
         kept = [event.id for event in await thread.call(Storage.events, "a")]

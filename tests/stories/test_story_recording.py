@@ -16,9 +16,9 @@ import pytest
 from service_process import QUICK_RECIPE, ServiceProcess, small_cell
 
 from sidelong.calibration.light_fit import fit_intensity
-from sidelong.evaluation.dataset import Dataset
 from sidelong.planning.light import DEFAULT_INTENSITY
 from sidelong.recipe import Recipe, light_model
+from sidelong.recorded.dataset import Dataset
 from sidelong.types import FloatArray
 
 ROBI = Path(__file__).parents[1] / "data/robi"

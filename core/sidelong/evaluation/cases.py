@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sidelong.errors import DepthError, UnknownNameError
-from sidelong.evaluation.dataset import Dataset, Scene
 from sidelong.evaluation.metrics import Truth, truth_of
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.transforms import invert
+from sidelong.recorded.dataset import Dataset, Scene
 from sidelong.types import DetectedObject, Hypothesis, View
 
 

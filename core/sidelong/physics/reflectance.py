@@ -47,6 +47,16 @@ def fall_off(projector_intensity: float, distance_m: FloatArray) -> FloatArray:
     return np.divide(projector_intensity, squared, out=np.zeros_like(squared), where=squared > 0)
 
 
+def vignetting(cos_off_axis: FloatArray, power: float) -> FloatArray:
+    """Return the share (...) of a projector's intensity that leaves it off its axis: cos^power, 0 beyond 90 degrees.
+
+    Not in the paper, whose L_p is a constant. Power 0 leaves the intensity as it is in all directions before the
+    projector.
+    """
+    ahead = cos_off_axis > 0
+    return np.where(ahead, np.where(ahead, cos_off_axis, 1.0) ** power, 0.0)
+
+
 def lambert(light: FloatArray, to_light: FloatArray, normals: FloatArray) -> FloatArray:
     """Return E_d = L_in (L . N), equation (2); 0 where theta exceeds pi/2.
 

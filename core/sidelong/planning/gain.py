@@ -11,53 +11,31 @@ from sidelong.geometry.camera_model import StereoRig
 from sidelong.geometry.mesh import Part, simplified
 from sidelong.geometry.raycast import SURFACE_OFFSET_M, RayScene
 from sidelong.geometry.transforms import invert, transform_points
-from sidelong.physics.reflectance import Phong, fall_off, incident_light, radiance
-from sidelong.physics.response import Response
-from sidelong.physics.sensing import SensingSettings, both_cameras, sensing_probability
+from sidelong.planning.prediction import Prediction
 from sidelong.planning.prior import Belief
-from sidelong.types import BoolArray, FloatArray, IntArray, Score, View
+from sidelong.planning.shading import LightModel, Surface, radiance_towards
+from sidelong.types import BoolArray, FloatArray, Forecast, IntArray, Score, View
 
 OCCLUDER_TRIANGLES = 3000
 REASONS = ("outside", "hidden", "shadow", "dark", "saturated")
-MEASURED = len(REASONS)
-"""Code of a point that the view is expected to measure; smaller codes index ``REASONS``."""
-
-
-@dataclass(frozen=True)
-class LightModel:
-    """Everything that turns geometry into the probability of depth.
-
-    Attributes
-    ----------
-    reflectances
-        By material index of the part.
-    intensity
-        Of the projector, at 1 m.
-    fall_off
-        Whether light falls with the squared distance; else it is the intensity at 1 m everywhere (the paper).
-    shadows
-        "none", "self" or "all": what may stand in the way of a ray.
-    exposure_s
-        Of the depth capture.
-    response, sensing
-        Sensor.
-    """
-
-    reflectances: tuple[Phong, ...]
-    intensity: float
-    fall_off: bool
-    shadows: str
-    exposure_s: float
-    response: Response
-    sensing: SensingSettings
+OUTSIDE, HIDDEN, SHADOW, DARK, SATURATED = range(len(REASONS))
 
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """What one view promises for each point: probability of depth (N,) and code (N,), see ``REASONS``."""
+    """What one view promises for each point.
+
+    Attributes
+    ----------
+    probability
+        (N,) of depth.
+    loss
+        (N,) position in ``REASONS`` of what takes the rest of the probability: ``DARK`` and ``SATURATED`` where
+        cameras and projector reach the point, the others where they do not.
+    """
 
     probability: FloatArray
-    code: IntArray
+    loss: IntArray
 
 
 class Planner:
@@ -80,17 +58,18 @@ class Planner:
 
     def __init__(self, belief: Belief, part: Part, rig: StereoRig, light: LightModel) -> None:
         self._rig, self._light = rig, light
-        self._priors = belief.priors
         sizes = [len(prior.pixels) for prior in belief.priors]
         self._prior_of_point = np.repeat(np.arange(len(sizes)), sizes)
-        self._points = _stack([p.points_base for p in belief.priors], 3)
-        self._normals = _stack([p.normals_base for p in belief.priors], 3)
+        self._surface = Surface(
+            _stack([p.points_base for p in belief.priors], 3),
+            _stack([p.normals_base for p in belief.priors], 3),
+            np.concatenate([np.zeros(0, np.intp), *(p.material for p in belief.priors)]),
+        )
         self._pixels = np.concatenate([np.zeros((0, 2), np.intp), *(p.pixels for p in belief.priors)])
-        self._material = np.concatenate([np.zeros(0, np.intp), *(p.material for p in belief.priors)])
         self._object = np.repeat([p.object_index for p in belief.priors], sizes).astype(np.intp)
         self._weight = np.repeat([p.probability * p.weight for p in belief.priors], sizes).astype(np.float64)
         # visibility rays start a little above the surface
-        self._starts = self._points + SURFACE_OFFSET_M * self._normals
+        self._starts = self._surface.points + SURFACE_OFFSET_M * self._surface.normals
         self._object_T_base = invert(np.array([p.base_T_object for p in belief.priors]).reshape(-1, 4, 4))
         self._starts_object = _stack(
             [
@@ -107,6 +86,8 @@ class Planner:
     def score(self, view: View, missing: BoolArray) -> Score:
         """Return G_i of one view over the pixels still missing, equation (13), and what is lost to what.
 
+        Gain and losses add up to the hypotheses' share of the missing pixels.
+
         Parameters
         ----------
         view
@@ -114,15 +95,53 @@ class Planner:
         missing
             (H, W) pixels of the reference view that have no depth yet.
         """
-        if view.name not in self._outlooks:
-            self._outlooks[view.name] = self._outlook(view)
-        outlook = self._outlooks[view.name]
+        outlook = self._outlook_of(view)
         weight = np.where(missing[self._pixels[:, 0], self._pixels[:, 1]], self._weight, 0.0)
-        lost = np.bincount(outlook.code, weights=weight, minlength=MEASURED + 1)
+        lost = np.bincount(outlook.loss, weights=weight * (1.0 - outlook.probability), minlength=len(REASONS))
         return Score(
             view=view,
             gain_px=float(weight @ outlook.probability),
             lost_px={reason: float(lost[code]) for code, reason in enumerate(REASONS)},
+        )
+
+    def forecast(self, view: View, missing: BoolArray, still_missing: BoolArray) -> Forecast:
+        """Set what a view promised beside what it gave.
+
+        Parameters
+        ----------
+        view
+            A view that was taken; scored before, it costs no more than a look-up.
+        missing, still_missing
+            (H, W) pixels of the reference view that had no depth before the view, and after it.
+        """
+        rows, columns = self._pixels[:, 0], self._pixels[:, 1]
+        chosen = missing[rows, columns]
+        return Forecast(
+            probability=self._outlook_of(view).probability[chosen],
+            weight=self._weight[chosen],
+            measured=~still_missing[rows, columns][chosen],
+        )
+
+    def predict(self, view: View) -> Prediction:
+        """Return what a view should show of every point of the belief, whether it promises depth or not."""
+        everything = np.arange(len(self._surface))
+        exposure = self._exposure(view, everything)
+        chosen = np.flatnonzero(self._inside(view) & (self._turned_away(view, everything) < 0))
+        chosen = chosen[self._blocked_by(view, chosen) < 0]
+        reached = np.zeros(len(self._surface), dtype=np.bool_)
+        reached[chosen] = True
+        in_left = transform_points(invert(view.base_T_camera), self._surface.points)
+        uv = self._rig.left.project(in_left)
+        shown = self._rig.left.contains(uv)
+        seen_at = np.where(shown[:, None], np.rint(np.where(shown[:, None], uv, 0.0))[:, ::-1], -1.0).astype(np.intp)
+        return Prediction(
+            pixels=self._pixels,
+            weight=self._weight,
+            exposure=exposure,
+            reached=reached,
+            probability=np.where(reached, self._light.kind.probability(exposure), 0.0),
+            seen_at=seen_at,
+            depth_m=in_left[:, 2],
         )
 
     def left_radiance(self, view: View) -> tuple[IntArray, FloatArray]:
@@ -135,48 +154,45 @@ class Planner:
         radiance
             (M,) E of equation (5), in units of the sensor's saturation exposure per second.
         """
-        left, _, projector = self._centres(view.base_T_camera)
-        chosen = np.flatnonzero(self._inside(view.base_T_camera))
-        for target in (left, projector):
+        (left, *_), base_T_projector = self._poses(view)
+        chosen = np.flatnonzero(self._inside(view))
+        for target in (left, base_T_projector[:3, 3]):
             chosen = chosen[~self._blocked(chosen, target)]
-        to_left, to_light = _unit(left - self._points[chosen]), _unit(projector - self._points[chosen])
-        power = self._incident(projector, chosen)
-        return self._pixels[chosen], self._radiance(power, (to_light, to_left), chosen)
+        e = radiance_towards((left,), base_T_projector, self._surface[chosen], self._light)
+        return self._pixels[chosen], e[:, 0]
+
+    def _outlook_of(self, view: View) -> Outlook:
+        """Predict what the view would measure, once: h of equation (12) for each point."""
+        if view.name not in self._outlooks:
+            self._outlooks[view.name] = self._outlook(view)
+        return self._outlooks[view.name]
 
     def _outlook(self, view: View) -> Outlook:
-        """Predict what the view would measure: h of equation (12) for each point."""
-        centres = self._centres(view.base_T_camera)
-        code = np.full(len(self._points), MEASURED, dtype=np.intp)
-        _mark(code, ~self._inside(view.base_T_camera), "outside")
-        probability = np.zeros(len(self._points))
-        rest = np.flatnonzero(code == MEASURED)
-        p, saturated, away = self._shade(centres, rest)
-        for reason, mask in (("saturated", saturated), ("dark", ~saturated & ~(p > 0)), *away):
-            code[rest[mask]] = REASONS.index(reason)
+        loss = np.full(len(self._surface), OUTSIDE, dtype=np.intp)
+        probability = np.zeros(len(self._surface))
+        inside = np.flatnonzero(self._inside(view))
+        exposure = self._exposure(view, inside)
+        p = self._light.kind.probability(exposure)
+        away = self._turned_away(view, inside)
+        loss[inside] = np.where(away >= 0, away, np.where((exposure >= 1.0).any(axis=1), SATURATED, DARK))
         # rays cost far more than shading: only points that would be measured need them
-        survivors = rest[code[rest] == MEASURED]
-        for reason, targets in (("hidden", centres[:2]), ("shadow", centres[2:])):
-            for target in targets:
-                blocked = self._blocked(survivors, target)
-                code[survivors[blocked]] = REASONS.index(reason)
-                survivors = survivors[~blocked]
-        probability[rest] = p
-        probability[code != MEASURED] = 0.0
-        return Outlook(probability, code)
+        bright = (p > 0) & (away < 0)
+        survivors, p = inside[bright], p[bright]
+        blocked = self._blocked_by(view, survivors)
+        loss[survivors] = np.where(blocked >= 0, blocked, loss[survivors])
+        probability[survivors] = np.where(blocked >= 0, 0.0, p)
+        return Outlook(probability, loss)
 
-    def _centres(self, base_T_left: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the centres of left camera, right camera and projector in the base frame, (3,) each."""
-        rig = self._rig
-        return (
-            base_T_left[:3, 3],
-            (base_T_left @ rig.left_T_right)[:3, 3],
-            (base_T_left @ rig.projector.left_T_projector)[:3, 3],
-        )
+    def _poses(self, view: View) -> tuple[tuple[FloatArray, ...], FloatArray]:
+        """Return the centres (3,) of the cameras that must see a point, and ``base_T_projector`` (4, 4)."""
+        base_T_left, rig = view.base_T_camera, self._rig
+        left, right = base_T_left[:3, 3], (base_T_left @ rig.left_T_right)[:3, 3]
+        return (left, right) if self._light.sensing.stereo else (left,), base_T_left @ rig.projector.left_T_projector
 
-    def _inside(self, base_T_left: FloatArray) -> BoolArray:
-        """Say which points fall into both images and the projector's cone."""
+    def _inside(self, view: View) -> BoolArray:
+        """Say which points fall into the images and the projector's cone."""
         rig = self._rig
-        in_left = transform_points(invert(base_T_left), self._points)
+        in_left = transform_points(invert(view.base_T_camera), self._surface.points)
         in_right = transform_points(invert(rig.left_T_right), in_left)
         in_projector = transform_points(invert(rig.projector.left_T_projector), in_left)
         inside = rig.left.contains(rig.left.project(in_left)) & rig.projector.lights(in_projector)
@@ -184,44 +200,33 @@ class Planner:
             inside &= rig.right.contains(rig.right.project(in_right))
         return inside
 
-    def _shade(self, centres: Sequence[FloatArray], chosen: IntArray):
-        """Return P, whether an image saturates, and masks of points that face away, for the chosen points."""
-        points, normals = self._points[chosen], self._normals[chosen]
-        to_left, to_right, to_light = (_unit(centre - points) for centre in centres)
-        light = self._light
-        power = self._incident(centres[2], chosen)
-        seen = [to_left, to_right] if light.sensing.stereo else [to_left]
-        saturated = np.zeros(len(points), dtype=np.bool_)
-        probabilities: list[FloatArray] = []
-        for to_camera in seen:
-            e = self._radiance(power, (to_light, to_camera), chosen)
-            clipped = light.response.saturated(e, light.exposure_s)
-            z = light.response.intensity(e, light.exposure_s)
-            probabilities.append(sensing_probability(z, clipped, light.sensing))
-            saturated |= clipped
-        away = (
-            ("shadow", np.einsum("ij,ij->i", normals, to_light) <= 0),
-            ("hidden", np.any([np.einsum("ij,ij->i", normals, d) <= 0 for d in seen], axis=0)),
-        )
-        p = both_cameras(probabilities[0], probabilities[1]) if light.sensing.stereo else probabilities[0]
-        return p, saturated, away
+    def _exposure(self, view: View, chosen: IntArray) -> FloatArray:
+        """Return what each camera receives from the chosen points (N, C), in units of the saturation exposure."""
+        cameras, base_T_projector = self._poses(view)
+        e = radiance_towards(cameras, base_T_projector, self._surface[chosen], self._light)
+        return e * (self._light.exposure_s / self._light.response.saturation_exposure)
 
-    def _incident(self, projector: FloatArray, chosen: IntArray) -> FloatArray:
-        """Return L_in of equation (1) at the chosen points."""
-        light = self._light
-        if not light.fall_off:
-            return incident_light(np.full(len(chosen), light.intensity))
-        return incident_light(fall_off(light.intensity, np.linalg.norm(projector - self._points[chosen], axis=1)))
+    def _turned_away(self, view: View, chosen: IntArray) -> IntArray:
+        """Return (N,) HIDDEN where a chosen point faces away from a camera, SHADOW from the projector, else -1."""
+        cameras, base_T_projector = self._poses(view)
+        points, normals = self._surface.points[chosen], self._surface.normals[chosen]
 
-    def _radiance(self, power: FloatArray, directions: tuple[FloatArray, FloatArray], chosen: IntArray) -> FloatArray:
-        """Return radiance, material by material."""
-        e = np.zeros(len(chosen))
-        for index, material in enumerate(self._light.reflectances):
-            mine = self._material[chosen] == index
-            e[mine] = radiance(
-                power[mine], (directions[0][mine], directions[1][mine]), self._normals[chosen[mine]], material
-            )
-        return e
+        def behind(target: FloatArray) -> BoolArray:
+            return np.einsum("ij,ij->i", normals, target - points) <= 0
+
+        hidden = np.any([behind(camera) for camera in cameras], axis=0)
+        return np.where(hidden, HIDDEN, np.where(behind(base_T_projector[:3, 3]), SHADOW, -1))
+
+    def _blocked_by(self, view: View, chosen: IntArray) -> IntArray:
+        """Return (N,) HIDDEN where a part hides a chosen point from a camera, SHADOW from the projector, else -1."""
+        cameras, base_T_projector = self._poses(view)
+        reason = np.full(len(chosen), -1, dtype=np.intp)
+        left = np.arange(len(chosen))
+        for target, code in (*((camera, HIDDEN) for camera in cameras), (base_T_projector[:3, 3], SHADOW)):
+            blocked = self._blocked(chosen[left], target)
+            reason[left[blocked]] = code
+            left = left[~blocked]
+        return reason
 
     def _blocked(self, chosen: IntArray, target: FloatArray) -> BoolArray:
         """Say which chosen points a part hides from ``target`` (3,): their own, or another one."""
@@ -235,13 +240,3 @@ class Planner:
 def _stack(arrays: Sequence[FloatArray], columns: int) -> FloatArray:
     """Concatenate (N_i, columns); none gives (0, columns)."""
     return np.concatenate([np.zeros((0, columns)), *arrays])
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    """Scale (N, 3) to unit length; a zero vector stays zero and so returns no light."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
-
-
-def _mark(code: IntArray, mask: BoolArray, reason: str) -> None:
-    code[mask] = REASONS.index(reason)

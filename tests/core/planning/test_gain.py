@@ -13,8 +13,9 @@ from sidelong.geometry.mesh import Part, part_from_arrays
 from sidelong.geometry.transforms import invert, look_at, rotation_about, transform
 from sidelong.physics.reflectance import Phong
 from sidelong.physics.response import Response
-from sidelong.physics.sensing import SensingSettings
+from sidelong.physics.sensing import SensingCurve, SensingSettings
 from sidelong.planning.gain import LightModel, Planner
+from sidelong.planning.light import LightSettings, MaterialSettings
 from sidelong.planning.prior import Belief, believe
 from sidelong.types import DetectedObject, Hypothesis, View
 
@@ -178,3 +179,126 @@ def test_a_camera_inside_a_part_sees_nothing_of_it() -> None:
     room = box((4.0, 4.0, 4.0))
     belief = believe(detected(at(0.0)), room, CAMERA, TOP.base_T_camera, EVERYWHERE)
     assert len(belief.priors[0].pixels) == 0
+
+
+SIDE = View("side", look_at((0.3, 0.1, 0.6), (0.0, 0.0, 0.0)))
+GRAZING = View("grazing", look_at((0.7, 0.0, 0.02), (0.0, 0.0, 0.0)))
+CURVE = SensingSettings(curve=SensingCurve(log_exposure=(-3.0, -0.5, 0.0, 1.0), probability=(0.0, 0.7, 0.9, 0.3)))
+MIRROR = Phong(0.05, 0.7, 20.0)
+
+
+@pytest.mark.parametrize("view", [TOP, SIDE, GRAZING])
+@pytest.mark.parametrize("sensing", [SensingSettings(z_min=60.0), CURVE])
+def test_gain_and_losses_add_up_to_what_is_missing(view: View, sensing: SensingSettings) -> None:
+    belief = belief_of(at(0.0), at(0.05, 0.03, 0.06))
+    score = Planner(belief, PLATE, rig(), light(MIRROR, sensing=sensing)).score(view, EVERYWHERE)
+    total = sum(prior.probability * prior.weight * len(prior.pixels) for prior in belief.priors)
+    assert score.gain_px + sum(score.lost_px.values()) == pytest.approx(total)
+    assert min(score.lost_px.values()) >= 0
+
+
+def exposure_from_above(pixels: np.ndarray, intensity: float, power: float = 0.0) -> np.ndarray:
+    """Lambert's law for the plate below the projector that looks straight down."""
+    (prior,) = belief_of(at(0.0)).priors
+    assert (prior.pixels == pixels).all()
+    projector = (TOP.base_T_camera @ rig().projector.left_T_projector)[:3, 3]
+    to_light = projector - prior.points_base
+    distance = np.linalg.norm(to_light, axis=1)
+    cosine = to_light[:, 2] / distance
+    return 0.5 * intensity * cosine**power / distance**2 * cosine * 0.012
+
+
+@pytest.mark.parametrize("intensity", [20.0, 200.0])
+def test_a_prediction_holds_the_exposure_of_each_pixel_and_the_curves_probability(intensity: float) -> None:
+    prediction = Planner(belief_of(at(0.0)), PLATE, rig(), light(intensity=intensity, sensing=CURVE)).predict(TOP)
+    expected = exposure_from_above(prediction.pixels, intensity)
+    np.testing.assert_allclose(prediction.exposure, np.stack([expected, expected], axis=1), rtol=1e-9)
+    assert prediction.reached.all()
+    assert CURVE.curve is not None
+    at_x = CURVE.curve.at(expected)
+    np.testing.assert_allclose(prediction.probability, np.where(at_x >= 0.54, at_x, 0.0), rtol=1e-9)
+    assert (prediction.seen_at == prediction.pixels).all()
+    np.testing.assert_allclose(prediction.depth_m, 0.695, atol=1e-6)
+
+
+@pytest.mark.parametrize("view", [TOP, SIDE, GRAZING])
+@pytest.mark.parametrize("sensing", [SensingSettings(z_min=30.0), CURVE])
+def test_predictions_sum_up_to_the_gain(view: View, sensing: SensingSettings) -> None:
+    poses = at(0.0), at(0.02, 0.01, 0.05)
+    planner = Planner(belief_of(*poses, probabilities=(0.7, 0.3)), PLATE, rig(), light(MIRROR, sensing=sensing))
+    prediction = planner.predict(view)
+    score = planner.score(view, EVERYWHERE)
+    assert prediction.weight @ prediction.probability == pytest.approx(score.gain_px)
+    unreached = score.lost_px["outside"] + score.lost_px["hidden"] + score.lost_px["shadow"]
+    # a dark point is counted as dark without asking what hides it
+    assert unreached <= prediction.weight[~prediction.reached].sum() + 1e-9
+
+
+def test_what_was_measured_is_depth_of_the_predicted_surface_and_of_nothing_else() -> None:
+    prediction = Planner(belief_of(at(0.0)), PLATE, rig(), light()).predict(TOP)
+    depth_m = np.full((CAMERA.height, CAMERA.width), np.nan)
+    depth_m[:, 71:74] = 0.695 + 0.0029
+    depth_m[:, 74:77] = 0.695 + 0.0031
+    depth_m[:, 77:80] = 0.695 - 0.0029
+    columns = prediction.pixels[:, 1]
+    expected = ((columns >= 71) & (columns < 74)) | ((columns >= 77) & (columns < 80))
+    assert (prediction.measured(depth_m) == expected).all()
+    assert (prediction.measured(depth_m, tolerance_m=0.0032) == (columns < 80)).all()
+
+
+def test_points_outside_the_image_are_not_measured_wherever_depth_is() -> None:
+    aside = View("aside", look_at((0.0, 0.0, 0.7), (0.6, 0.0, 0.0)))
+    prediction = Planner(belief_of(at(0.0)), PLATE, rig(), light()).predict(aside)
+    assert not prediction.reached.any()
+    assert (prediction.seen_at == -1).all()
+    assert not prediction.measured(np.full((CAMERA.height, CAMERA.width), prediction.depth_m[0])).any()
+
+
+def test_a_forecast_is_what_was_promised_beside_what_was_completed() -> None:
+    planner = Planner(belief_of(at(0.0)), PLATE, rig(), light())
+    missing, still_missing = EVERYWHERE.copy(), EVERYWHERE.copy()
+    missing[:, :75] = False
+    still_missing[:, :85] = False
+    forecast = planner.forecast(TOP, missing, still_missing)
+    assert forecast.weight @ forecast.probability == pytest.approx(planner.score(TOP, missing).gain_px)
+    assert len(forecast.measured) == 14 * 18  # columns 75 to 88
+    assert forecast.measured.sum() == 10 * 18
+
+
+def test_without_a_belief_there_is_nothing_to_predict() -> None:
+    belief = believe((), PLATE, CAMERA, TOP.base_T_camera, EVERYWHERE)
+    planner = Planner(belief, PLATE, rig(), light(sensing=CURVE))
+    prediction, forecast = planner.predict(TOP), planner.forecast(TOP, EVERYWHERE, EVERYWHERE)
+    assert prediction.exposure.shape == (0, 2)
+    assert prediction.measured(np.ones((CAMERA.height, CAMERA.width))).shape == (0,)
+    assert len(forecast.probability) == len(forecast.measured) == 0
+    assert sum(planner.score(TOP, EVERYWHERE).lost_px.values()) == 0.0
+
+
+@pytest.mark.parametrize("power", [0.5, 4.0])
+def test_off_its_axis_the_projector_is_weaker_by_the_cosine_to_a_power(power: float) -> None:
+    planner = Planner(belief_of(at(0.0)), PLATE, rig(), light(vignetting=power))
+    pixels, radiance = planner.left_radiance(TOP)
+    # the projector looks straight down: the angle off its axis is the angle of incidence
+    np.testing.assert_allclose(radiance * 0.012, exposure_from_above(pixels, 50.0, power), rtol=1e-9)
+    np.testing.assert_allclose(planner.predict(TOP).exposure[:, 0], radiance * 0.012, rtol=1e-9)
+
+
+def test_vignetting_follows_the_projector_where_it_is_turned() -> None:
+    turned = LightProjector(transform(rotation_about((0, 1, 0), 0.3), (0.05, 0.0, 0.0)), 0.6, 0.6)
+    askew = StereoRig(CAMERA, CAMERA, 0.1, turned)
+    plain, weaker = (
+        Planner(belief_of(at(0.0)), PLATE, askew, light(vignetting=power)).left_radiance(TOP)[1] for power in (0.0, 2.0)
+    )
+    (prior,) = belief_of(at(0.0)).priors
+    in_projector = (invert(TOP.base_T_camera @ turned.left_T_projector) @ np.insert(prior.points_base, 3, 1.0, 1).T).T
+    cosine = in_projector[:, 2] / np.linalg.norm(in_projector[:, :3], axis=1)
+    np.testing.assert_allclose(weaker / plain, cosine**2, rtol=1e-9)
+
+
+def test_a_material_that_gives_no_depth_is_dark_whatever_its_numbers() -> None:
+    absorbing = MaterialSettings(k_d=0.5, k_s=0.0, n=1.0, absorbing=True)
+    (reflectance,) = LightSettings(materials={"felt": absorbing}).reflectances(("felt",))
+    score = Planner(belief_of(at(0.0)), PLATE, rig(), light(reflectance)).score(TOP, EVERYWHERE)
+    assert score.gain_px == 0.0
+    assert score.lost_px["dark"] == pytest.approx(18 * 18)

@@ -20,9 +20,9 @@ import pytest
 from PIL import Image
 
 from sidelong.errors import DatasetError, ImageError, InputError, MeshError, PoseError, UnknownNameError
-from sidelong.evaluation.dataset import Dataset, Scene
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.raycast import RayScene
+from sidelong.recorded.dataset import Dataset, Scene
 from sidelong.types import FloatArray, Projector
 
 ROBI = Path(__file__).parents[2] / "data" / "robi"

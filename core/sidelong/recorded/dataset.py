@@ -3,7 +3,7 @@
 ::
 
     cam/Ensenso_{DEPTH,LEFT,RIGHT}.yml               intrinsics (px), baseline (mm), depth_unit (mm)
-    cam/rig.json                                     optional: projector and exposures
+    cam/rig.json                                     optional: projector, exposures, serial number
     models/<Object>.stl (.ply, .obj, .off) and .json CAD model in mm; optional materials
     <Object>/Scene_<k>/GT_world2obj.json             {name: pose of the object in the world, 4x4 by rows, mm}
     <Object>/Scene_<k>/GT_Depth*/DEPTH_<view>.png    true depth, often of a part of the views only
@@ -11,35 +11,45 @@
                               /Depth/DEPTH_<view>.png .json                   depth, camera pose in the world (mm)
                               /Stereo/{LEFT,RIGHT}_<view>.bmp .json           projector off
                               /StereoPattern/, /StereoWhite/                  projector on: dots; white (not in ROBI)
-    <Object>/Calibration/Phong/LEFT_white.bmp .json, GT_world2obj.json        optional: white capture of known poses
+    <Object>/Calibration/                            optional, see sidelong.recorded.captures
 
 The world is the base frame. Millimetres and depth units become metres on the line that reads them.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
+from sidelong.devices import CaptureRequest
 from sidelong.errors import DatasetError, ImageError, SettingsError, UnknownNameError
 from sidelong.geometry.camera_model import LightProjector, PinholeCamera, StereoRig
 from sidelong.geometry.mesh import Part, load_part
-from sidelong.geometry.transforms import invert, rotation_angle, transform, validated_transform
+from sidelong.geometry.transforms import invert, rotation_angle, transform
+from sidelong.recorded.files import (
+    MM,
+    count_in,
+    mapping_in,
+    number_in,
+    pose_from_mm,
+    read_counts,
+    read_gray,
+    read_json,
+    read_yaml,
+)
 from sidelong.types import FloatArray, Frame, GrayImage, Projector, View
 
-MM = 1e-3
 FOLDERS = {Projector.OFF: "Stereo", Projector.DOTS: "StereoPattern", Projector.WHITE: "StereoWhite"}
 CAD_SUFFIXES = (".stl", ".ply", ".obj", ".off")
 PROJECTOR_WIDTH_RAD = np.deg2rad(62.0)
 """Assumed where rig.json does not say: an Ensenso lights what its cameras see."""
-LARGEST_NUMBER = 1e12
-"""No length, angle or time in these files comes near; larger ones overflow somewhere."""
 _NOTHING: Mapping[str, Any] = {}
 SAME_PLACE_M, SAME_TURN_RAD = 1e-3, 2e-3
 """How far the pose of a true depth map may be from that of its view: the arm came back to it, after spraying."""
@@ -102,25 +112,39 @@ class Dataset:
     @cached_property
     def depth_unit_m(self) -> float:
         """Metres per count of the depth pictures. Raises DatasetError."""
-        return _number(self._intrinsics["DEPTH"], "depth_unit", self._yml("DEPTH")) * MM
+        return number_in(self._intrinsics["DEPTH"], "depth_unit", self._yml("DEPTH")) * MM
 
     @cached_property
     def rig(self) -> StereoRig:
         """Cameras and projector. Raises DatasetError where a file of ``cam/`` is missing or cannot be used."""
         left, right = self._camera("LEFT"), self._camera("RIGHT")
         named = next((side for side in ("DEPTH", "LEFT", "RIGHT") if "baseline" in self._intrinsics[side]), "DEPTH")
-        baseline_m = _number(self._intrinsics[named], "baseline", self._yml(named)) * MM
+        baseline_m = number_in(self._intrinsics[named], "baseline", self._yml(named)) * MM
         try:
             return StereoRig(left, right, baseline_m, self._projector(baseline_m))
         except SettingsError as error:
             raise DatasetError(f"{self.root / 'cam'}: {error}") from error
 
+    @cached_property
+    def serial(self) -> str:
+        """Serial number of the camera: of ``rig.json``, else one made of the intrinsics, which no two cameras share."""
+        given = self._rig_file.get("serial")
+        if given is not None:
+            return str(given)
+        numbers = json.dumps([sorted(self._intrinsics[side].items()) for side in ("LEFT", "RIGHT")], default=str)
+        return f"intrinsics-{hashlib.sha256(numbers.encode()).hexdigest()[:12]}"
+
+    def read_depth_m(self, path: Path) -> FloatArray:
+        """Read a depth picture (H, W) in the left camera, NaN where missing. Raises ImageError."""
+        counts = read_counts(path, self.rig.left)
+        return np.where(counts > 0, counts * self.depth_unit_m, np.nan)
+
     def exposure_s(self, projector: Projector) -> float | None:
         """Return the exposure of a kind of capture, None where the data set does not tell."""
         path = self.root / "cam/rig.json"
-        exposures = _mapping(self._rig_file.get("exposure_ms", _NOTHING), path)
+        exposures = mapping_in(self._rig_file.get("exposure_ms", _NOTHING), path)
         name = "off" if projector is Projector.OFF else "pattern"
-        return _number(exposures, name, path) * MM if name in exposures else None
+        return number_in(exposures, name, path) * MM if name in exposures else None
 
     def white_capture(self, object_name: str) -> WhiteCapture | None:
         """Return the object's capture under a white pattern, None where it has none.
@@ -134,17 +158,17 @@ class Dataset:
         image = folder / "LEFT_white.bmp"
         if not image.is_file():
             return None
-        about = _json(image.with_suffix(".json"))
-        view = View("white", _pose_m(about.get("cam_pose"), image.with_suffix(".json")))
-        exposure_s = _number(about, "exposure_ms", image.with_suffix(".json")) * MM
+        about = read_json(image.with_suffix(".json"))
+        view = View("white", pose_from_mm(about.get("cam_pose"), image.with_suffix(".json")))
+        exposure_s = number_in(about, "exposure_ms", image.with_suffix(".json")) * MM
         left = read_gray(image, self.rig.left)
         frame = Frame(view, left, None, None, Projector.WHITE, exposure_s)
-        return WhiteCapture(frame, _object_poses(folder / "GT_world2obj.json"))
+        return WhiteCapture(frame, object_poses(folder / "GT_world2obj.json"))
 
     def _camera(self, side: str) -> PinholeCamera:
         path, values = self._yml(side), self._intrinsics[side]
-        width, height = (_count(values, name, path) for name in ("width", "height"))
-        numbers = {name: _number(values, name, path, positive=False) for name in ("fx", "fy", "cx", "cy")}
+        width, height = (count_in(values, name, path) for name in ("width", "height"))
+        numbers = {name: number_in(values, name, path, positive=False) for name in ("fx", "fy", "cx", "cy")}
         try:
             return PinholeCamera(width, height, **numbers)
         except SettingsError as error:
@@ -155,22 +179,24 @@ class Dataset:
         path, about = self.root / "cam/rig.json", self._rig_file
         width_rad = float(PROJECTOR_WIDTH_RAD)
         if "projector_fov_x_deg" in about:
-            width_rad = float(np.deg2rad(_number(about, "projector_fov_x_deg", path)))
+            width_rad = float(np.deg2rad(number_in(about, "projector_fov_x_deg", path)))
         left_T_projector = transform(np.eye(3), (baseline_m / 2, 0.0, 0.0))
         if "projector_in_left" in about:
-            left_T_projector = _pose_m(about["projector_in_left"], path)
+            left_T_projector = pose_from_mm(about["projector_in_left"], path)
         left = self._camera("LEFT")
-        half_height_rad = float(np.arctan(np.tan(width_rad / 2) * left.height / left.width))
-        return LightProjector(left_T_projector, width_rad / 2, half_height_rad)
+        height_rad = 2 * float(np.arctan(np.tan(width_rad / 2) * left.height / left.width))
+        if "projector_fov_y_deg" in about:
+            height_rad = float(np.deg2rad(number_in(about, "projector_fov_y_deg", path)))
+        return LightProjector(left_T_projector, width_rad / 2, height_rad / 2)
 
     @cached_property
     def _rig_file(self) -> Mapping[str, Any]:
         path = self.root / "cam/rig.json"
-        return _json(path) if path.is_file() else _NOTHING
+        return read_json(path) if path.is_file() else _NOTHING
 
     @cached_property
     def _intrinsics(self) -> Mapping[str, Mapping[str, Any]]:
-        return {side: _yaml(self._yml(side)) for side in ("DEPTH", "LEFT", "RIGHT")}
+        return {side: read_yaml(self._yml(side)) for side in ("DEPTH", "LEFT", "RIGHT")}
 
     def _yml(self, side: str) -> Path:
         return self.root / "cam" / f"Ensenso_{side}.yml"
@@ -218,11 +244,16 @@ class Scene:
         if name not in self.names:
             raise UnknownNameError(f"{self.folder}: view {name!r} is unknown, known are {', '.join(self.names)}")
         path = self._file("Depth", f"DEPTH_{name}.json")
-        return View(name, _pose_m(_json(path).get("cam_pose"), path))
+        return View(name, pose_from_mm(read_json(path).get("cam_pose"), path))
 
     def depth_m(self, name: str) -> FloatArray:
         """Read the measured depth (H, W) of a view, NaN where missing. Raises ImageError."""
-        return self._depth(self._file("Depth", f"DEPTH_{name}.png"))
+        return self.dataset.read_depth_m(self._file("Depth", f"DEPTH_{name}.png"))
+
+    @property
+    def depth_files(self) -> tuple[Path, ...]:
+        """Files of the measured depth of all views."""
+        return tuple(self._file("Depth", f"DEPTH_{name}.png") for name in self.names)
 
     def distance_range_m(self) -> tuple[float, float] | None:
         """Return the distances between which nearly all of the scene was measured; None where nothing was.
@@ -248,20 +279,46 @@ class Scene:
     def exposure_s(self, name: str, projector: Projector) -> float | None:
         """Return the exposure of an image, None where neither it nor the data set tells."""
         path = self._file(FOLDERS[projector], f"LEFT_{name}.json")
-        about = _json(path) if path.is_file() else _NOTHING
+        about = read_json(path) if path.is_file() else _NOTHING
         if "exposure_ms" in about:
-            return _number(about, "exposure_ms", path) * MM
+            return number_in(about, "exposure_ms", path) * MM
         return self.dataset.exposure_s(projector)
+
+    def frame(self, view: View, request: CaptureRequest) -> Frame:
+        """Return what was recorded at a view.
+
+        A depth map needs no image: where no pattern image was recorded, ``left`` is the one with the projector off, and
+        ``projector`` says so. The exposure is the recorded one, the requested one where the recording does not tell.
+
+        Raises
+        ------
+        ImageError
+            A file is missing, damaged or of the wrong size.
+        """
+        shown = request.projector
+        left = self.image(view.name, shown)
+        if left is None and request.depth:
+            left = self.image(view.name, shown := Projector.OFF)
+        if left is None:
+            raise ImageError(f"{self.folder}: view {view.name} has no left image with the projector at {shown}")
+        return Frame(
+            view=view,
+            left=left,
+            right=self.image(view.name, shown, "RIGHT"),
+            depth_m=self.depth_m(view.name) if request.depth else None,
+            projector=shown,
+            exposure_s=self.exposure_s(view.name, request.projector) or request.exposure_s,
+        )
 
     @cached_property
     def base_T_objects(self) -> tuple[FloatArray, ...]:
         """True pose (4, 4) of each object. Raises DatasetError or PoseError."""
-        return _object_poses(self.folder / "GT_world2obj.json")
+        return object_poses(self.folder / "GT_world2obj.json")
 
     def true_depth_m(self, name: str) -> FloatArray | None:
         """Read the true depth (H, W) of a view, NaN where unknown; None where there is none. Raises ImageError."""
         path = self._true_depth_files.get(name)
-        return None if path is None else self._depth(path)
+        return None if path is None else self.dataset.read_depth_m(path)
 
     @cached_property
     def _true_depth_files(self) -> dict[str, Path]:
@@ -273,51 +330,13 @@ class Scene:
             about = path.with_suffix(".json")
             name: str | None = path.stem.removeprefix("DEPTH_")
             if about.is_file():
-                name = _nearest(_pose_m(_json(about).get("cam_pose"), about), views)
+                name = _nearest(pose_from_mm(read_json(about).get("cam_pose"), about), views)
             if name is not None:
                 files[name] = path
         return files
 
     def _file(self, folder: str, name: str) -> Path:
         return self.folder / "Ensenso" / folder / name
-
-    def _depth(self, path: Path) -> FloatArray:
-        counts = read_counts(path, self.dataset.rig.left)
-        return np.where(counts > 0, counts * self.dataset.depth_unit_m, np.nan)
-
-
-def read_gray(path: Path, camera: PinholeCamera) -> GrayImage:
-    """Read an 8-bit grey image (H, W) of the camera's size. Raises ImageError."""
-    return np.asarray(_picture(path, camera).convert("L"), dtype=np.uint8)
-
-
-def read_counts(path: Path, camera: PinholeCamera) -> FloatArray:
-    """Read a 16-bit grey picture (H, W) of the camera's size as numbers. Raises ImageError."""
-    picture = _picture(path, camera)
-    if not picture.mode.startswith("I"):
-        raise ImageError(f"{path}: its pixels are of kind {picture.mode!r}, a depth map has 16-bit grey ones")
-    return np.asarray(picture, dtype=np.float64)
-
-
-def _picture(path: Path, camera: PinholeCamera) -> Any:
-    """Decode a picture wholly and check its size: Pillow refuses truncated files, OpenCV fills them up."""
-    from PIL import Image
-
-    if not path.is_file():
-        raise ImageError(f"{path}: the image is missing")
-    try:
-        # decoding alone overlooks the checksums and the end of a PNG: a third of all flipped bytes gave another depth
-        with Image.open(path) as picture:
-            picture.verify()
-        with Image.open(path) as picture:
-            picture.load()
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ImageError(f"{path}: the image is truncated or damaged: {error}") from error
-    if picture.size != (camera.width, camera.height):
-        raise ImageError(
-            f"{path}: the image is {picture.width}x{picture.height} px, cam/ says {camera.width}x{camera.height} px"
-        )
-    return picture
 
 
 def _nearest(base_T_camera: FloatArray, views: tuple[View, ...]) -> str | None:
@@ -329,57 +348,6 @@ def _nearest(base_T_camera: FloatArray, views: tuple[View, ...]) -> str | None:
     return views[index].name if same else None
 
 
-def _object_poses(path: Path) -> tuple[FloatArray, ...]:
-    return tuple(_pose_m(pose, f"{path}: {name}") for name, pose in _json(path).items())
-
-
-def _pose_m(numbers: Any, name: Path | str) -> FloatArray:
-    """Read a pose in mm as metres. Raises PoseError."""
-    pose = validated_transform(() if numbers is None else numbers, str(name))
-    pose[:3, 3] *= MM
-    return pose
-
-
-def _json(path: Path) -> Mapping[str, Any]:
-    try:
-        content = json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path}: the file is missing") from error
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: cannot be read as JSON: {error}") from error
-    return _mapping(content, path)
-
-
-def _yaml(path: Path) -> Mapping[str, Any]:
-    import yaml
-
-    try:
-        # OpenCV writes a first line that YAML does not know
-        lines = path.read_text().splitlines()
-        return _mapping(yaml.safe_load("\n".join(line for line in lines if not line.startswith("%YAML"))), path)
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path}: the file is missing") from error
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise DatasetError(f"{path}: cannot be read as YAML: {error}") from error
-
-
-def _mapping(content: Any, path: Path) -> Mapping[str, Any]:
-    if not isinstance(content, dict):
-        raise DatasetError(f"{path}: holds {type(content).__name__}, needs names with values")
-    return cast("Mapping[str, Any]", content)
-
-
-def _number(values: Mapping[str, Any], name: str, path: Path, *, positive: bool = True) -> float:
-    value = values.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST_NUMBER:
-        raise DatasetError(f"{path}: {name} is {value!r:.40}, needs a finite number")
-    if positive and value <= 0:
-        raise DatasetError(f"{path}: {name} is {value!r:.40}, needs a number greater than 0")
-    return float(value)
-
-
-def _count(values: Mapping[str, Any], name: str, path: Path) -> int:
-    number = _number(values, name, path)
-    if number != int(number):
-        raise DatasetError(f"{path}: {name} is {number!r}, needs a whole number")
-    return int(number)
+def object_poses(path: Path) -> tuple[FloatArray, ...]:
+    """Read named poses (mm) as (4, 4) in metres. Raises DatasetError or PoseError."""
+    return tuple(pose_from_mm(pose, f"{path}: {name}") for name, pose in read_json(path).items())

@@ -1,0 +1,1 @@
+"""Recorded data: scenes in ROBI's layout, and captures that calibrations are made from."""
