@@ -6,13 +6,14 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sidelong.evaluation.reliability import Reliability
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.transforms import transform_points
 from sidelong.types import FloatArray, GrayImage, Step
@@ -42,6 +43,8 @@ class Record:
         One report a view.
     first, last
         The reference step, and the latest.
+    reliability
+        What was promised of each view beside what it gave.
     """
 
     camera: PinholeCamera
@@ -50,10 +53,12 @@ class Record:
     views: list[ViewReport] = field(default_factory=list[ViewReport])
     first: Step | None = None
     last: Step | None = None
+    reliability: Reliability = field(default_factory=Reliability)
 
     def add(self, step: Step) -> ViewReport:
         """Take a step in and return its report."""
         self.first, self.last = self.first or step, step
+        self.reliability = self.reliability.add(step.forecast)
         report = ViewReport.of(step)
         self.views.append(report)
         return report
@@ -67,7 +72,9 @@ def write_view(folder: Path, step: Step) -> Artifact:
     return _write(folder / f"view_{step.index:02d}.npz", _npz(arrays))
 
 
-def write_results(folder: Path, record: Record, draw: Callable[[Record], bytes]) -> list[Artifact]:
+def write_results(
+    folder: Path, record: Record, draw: Callable[[Record], Mapping[str, bytes]]
+) -> list[Artifact]:  # fmt: skip
     """Write the completed depth and all that goes with it; nothing where there is no reference view yet."""
     step = record.last
     if step is None:
@@ -76,7 +83,7 @@ def write_results(folder: Path, record: Record, draw: Callable[[Record], bytes])
         "depth.png": depth_png(_trusted_m(step)),
         "depth.npz": _depth_npz(step, record),
         "cloud.ply": _cloud(step, record),
-        "picture.png": draw(record),
+        **draw(record),
         "report.json": _report(step, record),
     }
     return [_write(folder / name, content) for name, content in contents.items()]
@@ -138,6 +145,7 @@ def _report(step: Step, record: Record) -> bytes:
         "doubtful_px": int(step.doubtful.sum()),
         "setup": record.setup.model_dump(mode="json", exclude={"recipe"}),
         "views": [view.model_dump(mode="json") for view in record.views],
+        "reliability": record.reliability.report().model_dump(mode="json"),
         "recipe": record.setup.recipe,
         "K": _intrinsics(record.camera).tolist(),
         "base_T_camera": _reference(record).view.base_T_camera.tolist(),

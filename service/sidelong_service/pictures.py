@@ -1,4 +1,4 @@
-"""The picture of a scan: what was missing, what is there now, and which view gave it."""
+"""The pictures of a scan: what was missing, what is there now, from which view; and what the forecasts were worth."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sidelong.evaluation import reliability
 from sidelong.types import FloatArray, Step
 from sidelong_service.artifacts import Record
 
@@ -18,8 +19,24 @@ MISSING_COLOUR = "#b00020"
 REFERENCE_COLOUR = "#d9d9d9"
 
 
-def draw(record: Record) -> bytes:
-    """Return the picture as PNG: image with the missing mask, depth before and after, pixels by view.
+def draw(record: Record) -> dict[str, bytes]:
+    """Return the pictures as PNG, by name; the reliability diagram where there is a view that was forecast.
+
+    Raises
+    ------
+    ValueError
+        The record has no reference view yet.
+    """
+    pictures = {"picture.png": draw_depths(record)}
+    if record.reliability.forecasts:
+        report = record.reliability.report()
+        title = f"{record.setup.part}: forecasts of {report.views} views"
+        pictures["reliability.png"] = reliability.draw(report, title)
+    return pictures
+
+
+def draw_depths(record: Record) -> bytes:
+    """Return the picture of the depth as PNG: image with the missing mask, depth before and after, pixels by view.
 
     Raises
     ------

@@ -23,9 +23,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "core" / "calibration"))
 
 from hand_eye_scene import BOARD, CAMERA, Noise, camera_T_board, error, exact_arm, scene, small_motion
 
-from sidelong.calibration.board import render_board
-from sidelong.calibration.hand_eye import HandEye, hand_eye_from_images, solve_hand_eye
-from sidelong.calibration.hand_eye_checks import HandEyeSettings
+from sidelong.calibration.hand_eye.board import render_board
+from sidelong.calibration.hand_eye.checks import HandEyeSettings
+from sidelong.calibration.hand_eye.solution import HandEye, hand_eye_from_images, solve_hand_eye
 
 POSES = (3, 5, 8, 12, 20, 30)
 TILTS_RAD = (0.25, 0.1, 0.05, 0.02)

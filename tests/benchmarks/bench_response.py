@@ -25,11 +25,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from sidelong.calibration.radiance_map import merge_bracket
-from sidelong.calibration.response_curve import fit_curve
-from sidelong.calibration.response_fit import fit_response
-from sidelong.calibration.response_samples import choose_samples, draw_pool, read_bracket
-from sidelong.calibration.response_solve import eliminate, solve_rising
+from sidelong.calibration.response.curve import fit_curve
+from sidelong.calibration.response.fit import fit_response
+from sidelong.calibration.response.radiance_map import merge_bracket
+from sidelong.calibration.response.samples import choose_samples, draw_pool, read_bracket
+from sidelong.calibration.response.solve import eliminate, solve_rising
 from sidelong.errors import CalibrationError
 from sidelong.physics.response import LEVELS
 

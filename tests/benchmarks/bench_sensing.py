@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from sidelong.calibration.forecast_scores import scores_of
 from sidelong.calibration.light_fit import fit_intensity
-from sidelong.calibration.sensing_fit import fit_sensing
-from sidelong.calibration.sensing_samples import SensingSamples, samples_of
+from sidelong.calibration.sensing.fit import fit_sensing
+from sidelong.calibration.sensing.samples import SensingSamples, samples_of
+from sidelong.calibration.sensing.scores import scores_of
 from sidelong.devices import CaptureRequest
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.transforms import invert

@@ -53,10 +53,21 @@ def test_each_view_tells_its_gains_its_times_and_why_others_were_not_taken(ended
     assert any("inter-reflection" in term for term in ended["setup"]["left_out"])
 
 
+def test_what_was_promised_of_each_view_stands_beside_what_it_gave(
+    service: ServiceProcess, ended: dict[str, Any]
+) -> None:
+    views, told = ended["views"][1:], json.loads(read(service, ended, "report.json"))["reliability"]
+    assert told["views"] == len(views)
+    assert told["predicted_px"] == pytest.approx(sum(view["predicted_gain_px"] for view in views))
+    assert told["measured_px"] > 0
+    assert sum(each["pixels"] for each in told["bins"]) >= told["predicted_px"]
+    assert read(service, ended, "reliability.png").startswith(b"\x89PNG")
+
+
 def test_files_have_the_checksums_and_sizes_that_are_listed(service: ServiceProcess, ended: dict[str, Any]) -> None:
     listed = service.http.get(f"/v1/scans/{ended['id']}/artifacts").json()["artifacts"]
     assert listed == ended["artifacts"]
-    names = {"depth.png", "depth.npz", "cloud.ply", "picture.png", "report.json"}
+    names = {"depth.png", "depth.npz", "cloud.ply", "picture.png", "reliability.png", "report.json"}
     assert {artifact["name"] for artifact in listed} == names | {"view_00.npz", "view_01.npz", "view_02.npz"}
     for artifact in listed:
         answer = service.http.get(f"/v1/scans/{ended['id']}/artifacts/{artifact['name']}")

@@ -17,6 +17,8 @@ from sidelong.planning.prior import believe
 from sidelong.types import DetectedObject, FloatArray, Frame, Hypothesis
 
 USABLE_GREY = (8, 247)
+REACH_LN = 1.6
+"""How far from the median of all pixels the intensity is looked for: a factor of 5 either way."""
 FEWEST_PIXELS = 200
 """Pixels between the usable grey levels that one parameter needs; fewer say nothing of the light."""
 
@@ -71,10 +73,10 @@ def fit_intensity(
     lit = radiance > 0
     pixels, radiance = pixels[lit], radiance[lit]
     measured = white.left[pixels[:, 0], pixels[:, 1]].astype(np.float64)
-    usable = int(((measured >= USABLE_GREY[0]) & (measured <= USABLE_GREY[1])).sum())
-    if usable < FEWEST_PIXELS:
+    usable = (measured >= USABLE_GREY[0]) & (measured <= USABLE_GREY[1])
+    if usable.sum() < FEWEST_PIXELS:
         raise InputError(
-            f"{white.view.name}: {usable} part pixels lie between grey levels {USABLE_GREY[0]} and {USABLE_GREY[1]}, "
+            f"{white.view.name}: {int(usable.sum())} part pixels lie between grey levels {USABLE_GREY[0]} and {USABLE_GREY[1]}, "
             f"the light intensity needs at least {FEWEST_PIXELS}"
         )
 
@@ -82,9 +84,10 @@ def fit_intensity(
         predicted = light.response.intensity(np.exp(log_intensity) * radiance, white.exposure_s)
         return float(np.abs(predicted - measured).mean())
 
-    # the loss has flat ends (all black, all white) and may have several dips: bracket on a grid first
-    brightest = np.log(light.response.saturation_exposure / (white.exposure_s * radiance.max()))
-    grid = brightest + np.linspace(-4.0, 8.0, 97)
+    # the loss has flat ends (all black, all white), where it may be least of all, and several dips between: look near
+    # what most of the pixels say that are neither black nor saturated
+    likely = float(np.median(np.log(light.response.radiance(measured, white.exposure_s) / radiance)[usable]))
+    grid = likely + np.linspace(-REACH_LN, REACH_LN, 33)
     start = grid[int(np.argmin([loss(x) for x in grid]))]
     best = minimize_scalar(loss, bounds=(start - 0.2, start + 0.2), method="bounded")
     return LightFit(float(np.exp(best.x)), float(best.fun), len(measured))

@@ -19,8 +19,8 @@ _ROOTS, _MASSES = np.array([-np.sqrt(3.0), 0.0, np.sqrt(3.0)]), np.array([1.0, 4
 NODES = tuple((x, y, p * q) for x, p in zip(_ROOTS, _MASSES, strict=True) for y, q in zip(_ROOTS, _MASSES, strict=True))
 """Gauss-Hermite rule of 3 x 3 points for a Gaussian of the plane: two coordinates and the mass of each."""
 
-KERNEL_RAD = 0.37
-"""Kernel width of a single normal, radians; for M normals it falls as M^(-1/6), the best rate in the plane."""
+NEIGHBOURS = 0.1
+"""A kernel reaches to the 0.1 M^(2/3)-th neighbour: as M grows its width falls as M^(-1/6), the best rate in the plane."""
 UNIT_TOLERANCE = 1e-4
 
 
@@ -219,8 +219,8 @@ class MirrorGeometry:
 def expected_normals(measured: FloatArray, sigma_rad: FloatArray, population: FloatArray) -> FloatArray:
     """Return the mean of the true normals given the measured ones: they shift to where normals are frequent.
 
-    Tweedie's formula: measured plus variance times the gradient of the log density of measured normals, here a kernel
-    estimate whose width follows the density (Abramson). Without it n of a surface with many normals towards the
+    Tweedie's formula: measured plus variance times the gradient of the log density of measured normals, here a
+    kernel estimate as wide as its neighbours are far. Without it n of a surface with many normals towards the
     projector comes out 10 % low at 2 degrees of noise.
 
     Parameters
@@ -232,12 +232,14 @@ def expected_normals(measured: FloatArray, sigma_rad: FloatArray, population: Fl
     population
         (M, 3) measured normals as they come, not chosen by angle.
     """
+    from scipy.spatial import cKDTree
+
     if not bool(sigma_rad.any()):
         return measured
-    width = np.full(len(population), KERNEL_RAD * len(population) ** (-1 / 6))
-    pilot = np.log(_kernel(population, population, width).sum(axis=1))
-    width *= np.clip(np.exp(0.5 * (pilot.mean() - pilot)), 0.1, 1.5)
-    width = np.maximum(width, max(float(sigma_rad.min()), 1e-3))
+    neighbours = min(max(8, round(NEIGHBOURS * len(population) ** (2 / 3))), len(population))
+    width = np.asarray(cKDTree(population).query(population, k=neighbours)[0], dtype=np.float64)[:, -1]
+    # features narrower than the error are no features of the surface
+    width = np.maximum(width, max(0.5 * float(sigma_rad.min()), 1e-3))
     weight = _kernel(measured, population, width)
     gradient = (weight / np.square(width)) @ population / weight.sum(axis=1, keepdims=True)
     gradient -= _dot(gradient, measured)[:, None] * measured

@@ -287,7 +287,7 @@ def _warnings(found: Found, judged: Judged) -> tuple[str, ...]:
         "nothing exceeds the noise: a longer exposure would lower the upper limits": judged.absorbing,
         f"{clipped:.0%} of the samples within {NEAR_MIRROR_DEG:g} deg of the mirror direction are saturated: n and k_s "
         "come from the flanks of the highlight, expose less to measure its peak": clipped > MUCH_SATURATED,
-        f"no sample within {NEAR_MIRROR_DEG:g} deg of the mirror direction, the nearest is at {nearest_deg:.0f} deg: a narrow highlight "
-        "would not have been seen": nearest_deg > NEAR_MIRROR_DEG,
+        f"no sample within {NEAR_MIRROR_DEG:g} deg of the mirror direction, the nearest is at {nearest_deg:.0f} deg: a narrow "
+        "highlight would not have been seen": nearest_deg > NEAR_MIRROR_DEG,
     }
     return tuple(text for text, applies in said.items() if applies)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pydantic import ValidationError
 
-from sidelong.calibration.board import BoardSettings
-from sidelong.calibration.hand_eye import HandEye, hand_eye_from_images
-from sidelong.calibration.hand_eye_picture import draw_hand_eye
+from sidelong.calibration.hand_eye.board import BoardSettings
+from sidelong.calibration.hand_eye.picture import draw_hand_eye
+from sidelong.calibration.hand_eye.solution import HandEye, hand_eye_from_images
 from sidelong.commissioning.documents import HandEyeDocument, PoseResidual
 from sidelong.commissioning.made import Captures, Made, Progress
 from sidelong.commissioning.tasks import HandEyeTask

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sidelong.calibration.radiance_map import RadianceMap, merge_bracket
-from sidelong.calibration.response_fit import ResponseFit, fit_response
+from sidelong.calibration.response.fit import ResponseFit, fit_response
+from sidelong.calibration.response.radiance_map import RadianceMap, merge_bracket
 from sidelong.commissioning.documents import ResponseDocument
 from sidelong.commissioning.figures import png, show_map
 from sidelong.commissioning.made import Captures, Made, Progress

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from sidelong.calibration.forecast_scores import Scores as ForecastScores
-from sidelong.calibration.sensing_fit import SensingFit, fit_sensing
-from sidelong.calibration.sensing_samples import SensingSamples, samples_of
+from sidelong.calibration.sensing.fit import SensingFit, fit_sensing
+from sidelong.calibration.sensing.samples import SensingSamples, samples_of
+from sidelong.calibration.sensing.scores import Scores as ForecastScores
 from sidelong.commissioning.documents import LightUsed, Scores, SensingDocument
 from sidelong.commissioning.figures import png
 from sidelong.commissioning.made import Captures, Made, Progress

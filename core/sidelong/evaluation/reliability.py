@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from sidelong.calibration.forecast_scores import BINS, equal_width, scores_of
+from sidelong.calibration.sensing.scores import BINS, equal_width, scores_of
 from sidelong.types import BoolArray, FloatArray, Forecast
 
 Z_95 = 1.959963984540054

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sidelong.calibration.board import BoardSettings, render_board
+from sidelong.calibration.hand_eye.board import BoardSettings, render_board
 from sidelong.geometry.transforms import invert, transform
 from sidelong.recorded.writing import pose_to_mm, write_gray, write_json, write_rig
 from sidelong.simulation.rig import rig_for

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.stats import binomtest
 
-from sidelong.calibration.forecast_scores import SUREST, equal_weight, scores_of
+from sidelong.calibration.sensing.scores import SUREST, equal_weight, scores_of
 from sidelong.devices import Cell
 from sidelong.evaluation.reliability import Reliability, draw, wilson
 from sidelong.geometry.transforms import invert

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sidelong.calibration.response_solve import LEAST_RISE, Normal, Solution, eliminate, smooth
+from sidelong.calibration.response.solve import LEAST_RISE, Normal, Solution, eliminate, smooth
 from sidelong.errors import CalibrationError
 from sidelong.physics.response import LEVELS
 from sidelong.types import FloatArray, IntArray

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from sidelong.calibration.park_martin import (
+from sidelong.calibration.hand_eye.park_martin import (
     Motions,
     Spread,
     board_scale,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sidelong.calibration.response_curve import slopes
-from sidelong.calibration.response_samples import read_bracket
+from sidelong.calibration.response.curve import slopes
+from sidelong.calibration.response.samples import read_bracket
 from sidelong.physics.response import LEVELS, Response
 from sidelong.types import BoolArray, FloatArray, GrayImage
 

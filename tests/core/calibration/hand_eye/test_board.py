@@ -12,7 +12,7 @@ from PIL import Image
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from sidelong.calibration.board import (
+from sidelong.calibration.hand_eye.board import (
     MARKERS,
     BoardObservation,
     BoardSettings,

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from sidelong.calibration.exponential_fit import fit_exponential
-from sidelong.calibration.forecast_scores import scores_of
-from sidelong.calibration.sensing_fit import SensingFit, fit_sensing
-from sidelong.calibration.sensing_samples import SensingSamples, samples_of
-from sidelong.calibration.unimodal_curve import REACH_LN
+from sidelong.calibration.sensing.exponential import fit_exponential
+from sidelong.calibration.sensing.fit import SensingFit, fit_sensing
+from sidelong.calibration.sensing.samples import SensingSamples, samples_of
+from sidelong.calibration.sensing.scores import scores_of
+from sidelong.calibration.sensing.unimodal_curve import REACH_LN
 from sidelong.errors import CalibrationError
 from sidelong.geometry.camera_model import LightProjector, PinholeCamera, StereoRig
 from sidelong.geometry.mesh import part_from_arrays

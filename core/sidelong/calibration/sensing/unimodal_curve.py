@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import isotonic_regression
 
-from sidelong.calibration.sensing_samples import SensingSamples
+from sidelong.calibration.sensing.samples import SensingSamples
 from sidelong.physics.sensing import SensingCurve, all_cameras
 from sidelong.types import FloatArray, IntArray
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sidelong.calibration.response_curve import CurveFit, fit_curve
-from sidelong.calibration.response_samples import (
+from sidelong.calibration.response.curve import CurveFit, fit_curve
+from sidelong.calibration.response.samples import (
     FEWEST_EXPOSURES,
     Bracket,
     Samples,
@@ -20,7 +20,7 @@ from sidelong.calibration.response_samples import (
     read_bracket,
     usable_images,
 )
-from sidelong.calibration.response_solve import DISCOUNT, Rising, solve_rising
+from sidelong.calibration.response.solve import DISCOUNT, Rising, solve_rising
 from sidelong.errors import CalibrationError
 from sidelong.physics.response import LEVELS, Response
 from sidelong.types import FloatArray, GrayImage

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sidelong.calibration.hand_eye import HandEye
+from sidelong.calibration.hand_eye.solution import HandEye
 from sidelong.types import FloatArray
 
 ARROW_SHARE = 0.05

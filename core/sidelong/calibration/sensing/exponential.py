@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sidelong.calibration.forecast_scores import SUREST
+from sidelong.calibration.sensing.scores import SUREST
 from sidelong.physics.response import LEVELS, Response
 from sidelong.physics.sensing import SensingSettings
 from sidelong.types import BoolArray, FloatArray, IntArray

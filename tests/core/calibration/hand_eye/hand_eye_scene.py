@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sidelong.calibration.board import BoardObservation, BoardSettings, observe
+from sidelong.calibration.hand_eye.board import BoardObservation, BoardSettings, observe
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.transforms import invert, transform, transform_points
 

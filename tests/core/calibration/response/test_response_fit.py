@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sidelong.calibration.radiance_map import merge_bracket
-from sidelong.calibration.response_fit import ResponseFit, fit_response
-from sidelong.calibration.response_samples import choose_samples, draw_pool, read_bracket
-from sidelong.calibration.response_solve import (
+from sidelong.calibration.response.fit import ResponseFit, fit_response
+from sidelong.calibration.response.radiance_map import merge_bracket
+from sidelong.calibration.response.samples import choose_samples, draw_pool, read_bracket
+from sidelong.calibration.response.solve import (
     SMALLEST_STEP,
     Normal,
     bending,

@@ -22,8 +22,8 @@ from typing import Literal
 
 import numpy as np
 
-from sidelong.calibration.board import BoardObservation
-from sidelong.calibration.park_martin import rotation_vectors
+from sidelong.calibration.hand_eye.board import BoardObservation
+from sidelong.calibration.hand_eye.park_martin import rotation_vectors
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.transforms import invert, transform, transform_points
 from sidelong.types import FloatArray

@@ -29,12 +29,12 @@ from PIL import Image
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from sidelong.calibration.board import BoardObservation, render_board
-from sidelong.calibration.hand_eye import hand_eye_from_images, solve_hand_eye
-from sidelong.calibration.hand_eye_checks import HandEyeSettings
-from sidelong.calibration.hand_eye_picture import draw_hand_eye
-from sidelong.calibration.hand_eye_refine import refine
-from sidelong.calibration.park_martin import Motions, board_scale, park_martin, relative_motions, spread
+from sidelong.calibration.hand_eye.board import BoardObservation, render_board
+from sidelong.calibration.hand_eye.checks import HandEyeSettings
+from sidelong.calibration.hand_eye.park_martin import Motions, board_scale, park_martin, relative_motions, spread
+from sidelong.calibration.hand_eye.picture import draw_hand_eye
+from sidelong.calibration.hand_eye.refine import refine
+from sidelong.calibration.hand_eye.solution import hand_eye_from_images, solve_hand_eye
 from sidelong.errors import CalibrationError, ImageError, PoseError
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.transforms import invert, rotation_about, transform, transform_points

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sidelong.calibration.exponential_fit import fit_exponential
-from sidelong.calibration.forecast_scores import Scores, scores_of
-from sidelong.calibration.sensing_samples import SensingSamples
-from sidelong.calibration.unimodal_curve import PSEUDO_COUNT, BinnedCurve, binned_sum, fit_curve
+from sidelong.calibration.sensing.exponential import fit_exponential
+from sidelong.calibration.sensing.samples import SensingSamples
+from sidelong.calibration.sensing.scores import Scores, scores_of
+from sidelong.calibration.sensing.unimodal_curve import PSEUDO_COUNT, BinnedCurve, binned_sum, fit_curve
 from sidelong.errors import CalibrationError
 from sidelong.physics.response import Response
 from sidelong.physics.sensing import PaperSensing, SensingCurve, SensingSettings, all_cameras

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sidelong.calibration.board import BoardObservation, BoardSettings, detect_board
-from sidelong.calibration.hand_eye_checks import (
+from sidelong.calibration.hand_eye.board import BoardObservation, BoardSettings, detect_board
+from sidelong.calibration.hand_eye.checks import (
     FEWEST_POSES,
     FEWEST_TO_DOUBT,
     POOR_SPREAD_RAD,
@@ -27,8 +27,8 @@ from sidelong.calibration.hand_eye_checks import (
     repeated,
     validated_arm,
 )
-from sidelong.calibration.hand_eye_refine import Refined, predicted_px, refine
-from sidelong.calibration.park_martin import Spread, park_martin, spread
+from sidelong.calibration.hand_eye.park_martin import Spread, park_martin, spread
+from sidelong.calibration.hand_eye.refine import Refined, predicted_px, refine
 from sidelong.errors import CalibrationError
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.transforms import invert, rotation_angle, transform_points

@@ -1,0 +1,1 @@
+"""The photometric response of a sensor from an exposure bracket."""

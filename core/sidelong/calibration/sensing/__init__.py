@@ -1,0 +1,1 @@
+"""The probability of depth against exposure, learned from captures."""
