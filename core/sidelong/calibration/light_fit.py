@@ -12,13 +12,14 @@ from sidelong.errors import InputError
 from sidelong.geometry.camera_model import StereoRig
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.transforms import invert
+from sidelong.physics.response import Response
 from sidelong.planning.gain import LightModel, Planner
 from sidelong.planning.prior import believe
-from sidelong.types import DetectedObject, FloatArray, Frame, Hypothesis
+from sidelong.types import BoolArray, DetectedObject, FloatArray, Frame, Hypothesis
 
 USABLE_GREY = (8, 247)
-REACH_LN = 1.6
-"""How far from the median of all pixels the intensity is looked for: a factor of 5 either way."""
+REACH_LN = 0.9
+"""How far from the convex minimum the intensity is looked for: a factor of 2.5 either way."""
 FEWEST_PIXELS = 200
 """Pixels between the usable grey levels that one parameter needs; fewer say nothing of the light."""
 
@@ -76,18 +77,35 @@ def fit_intensity(
     usable = (measured >= USABLE_GREY[0]) & (measured <= USABLE_GREY[1])
     if usable.sum() < FEWEST_PIXELS:
         raise InputError(
-            f"{white.view.name}: {int(usable.sum())} part pixels lie between grey levels {USABLE_GREY[0]} and {USABLE_GREY[1]}, "
-            f"the light intensity needs at least {FEWEST_PIXELS}"
+            f"{white.view.name}: {int(usable.sum())} part pixels lie between grey levels {USABLE_GREY[0]} and "
+            f"{USABLE_GREY[1]}, the light intensity needs at least {FEWEST_PIXELS}"
         )
 
     def loss(log_intensity: float) -> float:
         predicted = light.response.intensity(np.exp(log_intensity) * radiance, white.exposure_s)
         return float(np.abs(predicted - measured).mean())
 
-    # the loss has flat ends (all black, all white), where it may be least of all, and several dips between: look near
-    # what most of the pixels say that are neither black nor saturated
-    likely = float(np.median(np.log(light.response.radiance(measured, white.exposure_s) / radiance)[usable]))
-    grid = likely + np.linspace(-REACH_LN, REACH_LN, 33)
-    start = grid[int(np.argmin([loss(x) for x in grid]))]
-    best = minimize_scalar(loss, bounds=(start - 0.2, start + 0.2), method="bounded")
-    return LightFit(float(np.exp(best.x)), float(best.fun), len(measured))
+    # in grey levels the loss has flat ends (all black, all white), where it may be least of all, and several dips: look
+    # for one near the minimum of a convex loss, and stay there where there is none
+    likely = _likely(measured, usable, radiance, light.response, white.exposure_s)
+    best = minimize_scalar(loss, bounds=(likely - REACH_LN, likely + REACH_LN), method="bounded")
+    at_end = abs(best.x - likely) > 0.95 * REACH_LN
+    log_intensity = likely if at_end else float(best.x)
+    return LightFit(float(np.exp(log_intensity)), loss(log_intensity), len(measured))
+
+
+def _likely(
+    measured: FloatArray, usable: BoolArray, radiance: FloatArray, response: Response, exposure_s: float
+) -> float:
+    """Return the ln intensity with the least sum of |ln predicted - ln measured|, clipped pixels counting as bounds."""
+    clipped = measured > USABLE_GREY[1]
+    # the ln intensity at which each pixel would be right, or from which on (below which) it is
+    ends = np.clip(measured, *USABLE_GREY)
+    right = np.log(response.radiance(ends, exposure_s) / radiance)
+
+    def loss(log_intensity: float) -> float:
+        over = log_intensity - right
+        return float(np.where(usable, np.abs(over), np.where(clipped, np.maximum(-over, 0), np.maximum(over, 0))).sum())
+
+    low, high = float(right[usable].min()), float(right[usable].max())
+    return float(minimize_scalar(loss, bounds=(low, high), method="bounded").x)

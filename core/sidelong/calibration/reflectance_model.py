@@ -20,7 +20,7 @@ NODES = tuple((x, y, p * q) for x, p in zip(_ROOTS, _MASSES, strict=True) for y,
 """Gauss-Hermite rule of 3 x 3 points for a Gaussian of the plane: two coordinates and the mass of each."""
 
 NEIGHBOURS = 0.1
-"""A kernel reaches to the 0.1 M^(2/3)-th neighbour: as M grows its width falls as M^(-1/6), the best rate in the plane."""
+"""A kernel reaches to the 0.1 M^(2/3)-th neighbour: its width falls as M^(-1/6), the best rate in the plane."""
 UNIT_TOLERANCE = 1e-4
 
 

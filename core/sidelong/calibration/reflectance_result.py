@@ -25,7 +25,7 @@ LARGEST_WIDTH, LARGEST_SHARE_WIDTH = 0.5, 0.1
 CHI_SQUARED_95 = 7.815
 """95 % point for three parameters."""
 LARGEST_CONDITION = 1e16
-LARGE_TILT_DEG, LARGE_MISFIT, MANY_OUTLIERS, NEAR_MIRROR_DEG, MUCH_SATURATED = 0.5, 0.1, 0.1, 20.0, 0.3
+LARGE_TILT_DEG, LARGE_MISFIT, MANY_OUTLIERS, NEAR_MIRROR_DEG, MUCH_SATURATED = 0.5, 0.1, 0.05, 20.0, 0.3
 """What deserves a warning."""
 
 
@@ -287,7 +287,7 @@ def _warnings(found: Found, judged: Judged) -> tuple[str, ...]:
         "nothing exceeds the noise: a longer exposure would lower the upper limits": judged.absorbing,
         f"{clipped:.0%} of the samples within {NEAR_MIRROR_DEG:g} deg of the mirror direction are saturated: n and k_s "
         "come from the flanks of the highlight, expose less to measure its peak": clipped > MUCH_SATURATED,
-        f"no sample within {NEAR_MIRROR_DEG:g} deg of the mirror direction, the nearest is at {nearest_deg:.0f} deg: a narrow "
-        "highlight would not have been seen": nearest_deg > NEAR_MIRROR_DEG,
+        f"no sample within {NEAR_MIRROR_DEG:g} deg of the mirror direction, the nearest is at {nearest_deg:.0f} deg: a "
+        "narrow highlight would not have been seen": nearest_deg > NEAR_MIRROR_DEG,
     }
     return tuple(text for text, applies in said.items() if applies)

@@ -21,6 +21,7 @@ LIMITS_N = (0.02, 1e7)
 LARGEST_SHARE = 1e3
 """Bound of k_d and k_s, over the largest radiance per light of the samples."""
 NEAREST = 3
+NEAR_RAD = np.deg2rad(20.0)
 STIFFNESS = 20.0
 """How much smaller the prior's tilt about the mean mirror direction is."""
 ITERATIONS = 30
@@ -47,12 +48,13 @@ def search_bounds(samples: ReflectanceSamples, tilt_sigma_rad: float) -> tuple[F
     """Return the bounds (6,) of the parameters that these samples can tell apart.
 
     A lobe that falls between the samples, or is far narrower than the error of the normals, may be as high as one
-    likes. So n ends where the fourth nearest sample gets a twentieth of the peak, or where a lobe is a seventh as wide
-    as the error of the mirror ray.
+    likes. So n ends where the fourth nearest sample gets a twentieth of the peak (a ten thousandth, where that sample is
+    far: nothing then speaks against a lobe), or where a lobe is a seventh as wide as the error of the mirror ray.
     """
     nearest = float(np.partition(samples.alpha_rad, NEAREST)[NEAREST])
     width_squared = max(nearest**2, 0.5 * float(np.median(np.square(samples.normal_sigma_rad))))
-    highest_n = float(np.clip(2.0 * np.log(20.0) / max(width_squared, 1e-12), 1.0, LIMITS_N[1]))
+    left = 0.05 if nearest < NEAR_RAD else 1e-4
+    highest_n = float(np.clip(-2.0 * np.log(left) / max(width_squared, 1e-12), 1.0, LIMITS_N[1]))
     lit = samples.light > 0
     share = LARGEST_SHARE * max(float((samples.radiance[lit] / samples.light[lit]).max()), 1e-12)
     share = max(share, LARGEST_SHARE * float(np.median(samples.sigma[lit] / samples.light[lit])))

@@ -18,6 +18,8 @@ ORDER_STRIDE = 4
 """Of the pool, every so manyth pixel serves to compare the brightness of two images."""
 SLOW_ROUND = 200
 """A round that adds less than one part in this of the pixels wanted is the last; the rest is drawn at random."""
+RARE_HITS = 8
+"""Pixels of a level, all images together, below which more of them are looked for in the whole images."""
 FEWEST_EXPOSURES = 3
 SMALLEST_SPAN = 2.0
 """Longest over shortest exposure: one stop, below it the steps in grey drown in rounding."""
@@ -245,15 +247,17 @@ def _even_choice(grey: GrayImage, free: BoolArray, count: int, random: np.random
 
 
 def _rare_pixels(bracket: Bracket, pool: IntArray) -> IntArray:
-    """Return one pixel for each level of each image that the pool misses and the image has."""
+    """Return pixels with levels of which the pool has few: one for each image that has the level, and the pool not."""
     if len(pool) == bracket.images[0].size:
         return np.empty(0, dtype=np.intp)
+    hits = np.stack([np.bincount(row, minlength=LEVELS) for row in bracket.grey(pool)])
+    rare = hits.sum(axis=0) < RARE_HITS
+    rare[[0, LEVELS - 1]] = False  # clipped
     found: set[int] = set()
-    for image, row in zip(bracket.images, bracket.grey(pool), strict=True):
-        missing = np.flatnonzero(np.bincount(row, minlength=LEVELS)[: LEVELS - 1] == 0)
+    for image, hit in zip(bracket.images if rare.any() else (), hits, strict=False):
         content = image.tobytes()  # for a rare level, searching bytes is many times faster than indexing the image
         middle = len(content) // 2  # where the scene is; the border is often empty
-        levels: list[int] = missing[missing > 0].tolist()
+        levels: list[int] = np.flatnonzero(rare & (hit == 0)).tolist()
         for level in levels:
             place = content.find(level, middle)
             found.add(place if place >= 0 else content.find(level, 0, middle))

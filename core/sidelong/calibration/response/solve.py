@@ -206,7 +206,7 @@ def solve_rising(normal: Normal, smoothness: float) -> Rising:
         upper = np.linalg.cholesky(scaled).T
     except np.linalg.LinAlgError as error:
         raise CalibrationError("bracket: the condition number is infinite: grey levels are not linked") from error
-    half = solve_triangular(upper, np.eye(LEVELS - 1))
+    half = solve_triangular(upper, np.eye(LEVELS - 1), check_finite=False)
     # 1-norm times the trace of the inverse: an upper bound, close where the condition is bad
     condition = float(np.linalg.norm(scaled, 1) * (half**2).sum())
     root = (basis * scale) @ half  # times its transpose: the inverse of the system in g
