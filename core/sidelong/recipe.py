@@ -194,6 +194,10 @@ def _left_out(recipe: Recipe, part: Part, *, given: bool) -> tuple[str, ...]:
         "score of all candidates: left out, the strategy does not compare them": (
             recipe.planning.strategy is not StrategyName.NBV
         ),
+        f"response of the sensor: left out, not calibrated, gamma {recipe.light.gamma:g} stands in": (
+            recipe.light.response_table is None
+        ),
+        "sensing curve: left out, none was learned, equation (7) stands in": recipe.sensing.curve is None,
         "ambient light: left out, the projector outshines it (paper, equation (1))": True,
         "inter-reflection: left out, not modelled yet": True,
     }

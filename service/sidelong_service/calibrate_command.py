@@ -158,11 +158,14 @@ def _make_here(task: Task, root: Path, object_name: str | None, settings: Settin
     from sidelong_service.calibration_store import CalibrationStore
 
     job = CapturesJob(root=root, object=object_name, task=task)
-    with CountedProgress(err) as progress:
-        shown = _Shown(progress)
-        CalibrationRun(job, settings, CalibrationStore(output), shown).run()
-    for each in shown.made:
-        _tell(output / f"{each}.json", output / f"{each}.png")
+    progress = CountedProgress(err)
+    shown = _Shown(progress)
+    try:
+        with progress:
+            CalibrationRun(job, settings, CalibrationStore(output), shown).run()
+    finally:  # what was made before an end stays
+        for each in shown.made:
+            _tell(output / f"{each}.json", output / f"{each}.png")
 
 
 def _make_on_service(client: SidelongClient, request: CalibrationRequest, output: Path) -> None:

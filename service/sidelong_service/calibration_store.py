@@ -35,7 +35,7 @@ class CalibrationStore:
         """
         path = self.folder / f"{calibration_id}.json"
         # an id is no path
-        if path.parent != self.folder or not path.is_file():
+        if path.name != f"{calibration_id}.json" or not _is_file(path):
             raise UnknownNameError(f"calibration {calibration_id!r:.80} is unknown")
         document = read_document(path)
         if document.id != calibration_id:
@@ -48,7 +48,7 @@ class CalibrationStore:
 
     def listed(self) -> CalibrationList:
         """Return what there is, newest first; files that cannot be used come last, with the reason."""
-        found = [self._summary(path.stem) for path in sorted(self.folder.glob("*.json"))]
+        found = [self._summary(path.stem) for path in sorted(self.folder.glob("*.json")) if path.is_file()]
         good = [each for each in found if each.created_at is not None]
         good.sort(key=lambda each: each.created_at or 0, reverse=True)  # pyright: ignore[reportArgumentType, reportCallIssue]
         return CalibrationList(calibrations=(*good, *(each for each in found if each.created_at is None)))
@@ -86,3 +86,10 @@ class CalibrationStore:
             created_at=document.created_at,
             warnings=document.warnings,
         )
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name longer than any file's
+        return False

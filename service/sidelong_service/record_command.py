@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pydantic import ValidationError
 
 from sidelong.types import Projector
-from sidelong_service.command import CommandError, ConfigFile, err, out, plain_errors
+from sidelong_service.command import CommandError, ConfigFile, err, first_fields, out, plain_errors
 from sidelong_service.console import CountedProgress
 
 if TYPE_CHECKING:
@@ -29,6 +31,7 @@ Exposure = Annotated[float, typer.Option("--exposure-ms", min=1e-3, max=1e4)]
 Shown = Annotated[Projector, typer.Option(help="What the projector shows.")]
 PROJECTOR_ON_MS, PROJECTOR_OFF_MS = 12.0, 200.0
 BRACKET_MS = "3,6,12,25,50,100,200,400,800"
+FEWEST_EXPOSURES = 3
 
 
 @record.command()
@@ -45,6 +48,8 @@ def bracket(
     """Take an exposure bracket of the scene: for `sidelong calibrate response`."""
     with plain_errors():
         exposures_s = [_milliseconds(each) for each in exposures_ms.split(",") if each.strip()]
+        if len(set(exposures_s)) < FEWEST_EXPOSURES:
+            raise CommandError(f"--exposures-ms: {exposures_ms!r:.80} has fewer than {FEWEST_EXPOSURES} exposures")
         with CountedProgress(err) as progress:
 
             def show(done: int, total: int) -> None:
@@ -118,6 +123,34 @@ def board(
         _record(config, root, object_name, view, take)
 
 
+@record.command("print-board")
+def print_board(
+    folder: Annotated[Path, typer.Argument(help="Where board.png, to print, and board.json go.")],
+    squares: Annotated[str, typer.Option(help="Along x and y.")] = "11x8",
+    square_mm: Annotated[float, typer.Option("--square-mm")] = 20.0,
+    marker_mm: Annotated[float, typer.Option("--marker-mm")] = 15.0,
+    dictionary: Annotated[str, typer.Option(help="ArUco dictionary of the markers.")] = "DICT_4X4_50",
+) -> None:
+    """Draw a ChArUco board in true scale, with the description that `record board` and `calibrate hand-eye` need."""
+    from sidelong.calibration.hand_eye.board import BoardSettings, board_png
+    from sidelong_service.artifacts import write_whole
+
+    with plain_errors():
+        x, _, y = squares.partition("x")
+        about = {"square_m": square_mm * 1e-3, "marker_m": marker_mm * 1e-3, "dictionary": dictionary}
+        try:
+            board = BoardSettings.model_validate({"squares_x": int(x), "squares_y": int(y), **about})
+        except ValidationError as error:
+            raise CommandError(first_fields(error)) from error
+        except ValueError as error:
+            raise CommandError(f"--squares: {squares!r:.40} is not like 11x8") from error
+        write_whole(folder / "board.png", board_png(board))
+        write_whole(folder / "board.json", board.model_dump_json(indent=1).encode())
+        for name in ("board.png", "board.json"):
+            out.print(f"  {folder / name}", highlight=False, markup=False, soft_wrap=True)
+        out.print("print at 100 %, then measure a row of squares: 0.1 % off is 0.7 mm at the camera", highlight=False)
+
+
 def _record(
     config: Path | None,
     root: Path,
@@ -127,8 +160,10 @@ def _record(
 ) -> None:
     from sidelong.commissioning.recording import Recorder
     from sidelong_service.local import devices_at
-    from sidelong_service.settings import load_settings
+    from sidelong_service.settings import NAME_PATTERN, load_settings
 
+    if object_name is not None and not re.fullmatch(NAME_PATTERN, object_name):
+        raise CommandError(f"--object: {object_name!r:.80} is no name of an object")
     with devices_at(load_settings(config).cell, view) as (camera, base_T_flange, base_T_camera):
         for file in take(Recorder(camera, base_T_flange, base_T_camera, root, object_name)):
             out.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)

@@ -16,6 +16,9 @@ from sidelong.types import BoolArray, FloatArray, GrayImage, IntArray
 ROUNDS = 8
 HUBER = 2.5
 """Residuals beyond this many deviations count linearly."""
+FEWEST_TILES = 60
+ROUNDING = 1e-9
+"""Share of a value below which its residual is not called one: exact planes exist in simulations."""
 
 
 class ProjectorFitSettings(BaseModel):
@@ -29,7 +32,7 @@ class ProjectorFitSettings(BaseModel):
     saturated_grey: int = Field(default=250, ge=2, le=LEVELS - 1, description="from here on not used")
     dark_grey: int = Field(default=10, ge=1, le=200, description="up to here not used")
     cone_margin: FiniteFloat = Field(default=0.03, ge=0, lt=1, description="share of the lit cone's edge left out")
-    tile_px: int = Field(default=32, ge=1, description="pixels of a square this wide share their errors")
+    tile_px: int = Field(default=32, ge=1, description="most pixels of a square whose errors go together")
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +102,8 @@ def plane_rows(capture: PlaneCapture, rig: StereoRig, response: Response, settin
             f"{int(lit.sum())} lit ones {int(saturated.sum())} are at grey level {settings.saturated_grey} or above, "
             f"{int(dark.sum())} at {settings.dark_grey} or below: change the exposure, or fill more of the image"
         )
+    # few tiles would tell nothing of their scatter
+    tile_px = max(1, min(settings.tile_px, int(np.sqrt(usable.sum() / FEWEST_TILES))))
     pixels = np.argwhere(usable)
     pixels = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), settings.most_pixels)).astype(np.intp)]
     v, u = pixels.T
@@ -107,7 +112,7 @@ def plane_rows(capture: PlaneCapture, rig: StereoRig, response: Response, settin
         log_axial=np.log(in_projector[v, u, 2] / distance[v, u]),
         log_distance=np.log(distance[v, u]),
         cos_alpha=2.0 * cos_light[v, u] * cos_camera[v, u] - np.einsum("ij,ij->i", to_light[v, u], to_camera[v, u]),
-        tile=(v // settings.tile_px) * 10_000 + u // settings.tile_px,
+        tile=(v // tile_px) * 10_000 + u // tile_px,
         pixels=pixels,
         plane_rms_m=plane_rms_m,
         saturated=int(saturated.sum()),
@@ -120,13 +125,22 @@ def _on_plane(
 ) -> tuple[FloatArray, BoolArray, float, FloatArray]:
     """Return points (H, W, 3) on the plane, where there is depth of it, the rms distance, and the normal (3,)."""
     wanted = (rig.left.height, rig.left.width)
-    for name, image in (("image", capture.left), ("depth", capture.depth_m), ("mask", capture.mask)):
+    for name, image in (
+        ("image", capture.left),
+        ("depth", capture.depth_m),
+        ("mask", capture.mask),
+        ("off image", capture.off),
+    ):
         if image is not None and image.shape != wanted:
             raise CalibrationError(
                 f"{capture.name}: the {name} has shape {image.shape}, the camera has {wanted} (rows, columns)"
             )
     if not 0 < capture.exposure_s < np.inf:
         raise CalibrationError(f"{capture.name}: its exposure is {capture.exposure_s} s, needs a positive number")
+    if capture.off is not None and not 0 < (capture.off_exposure_s or 0.0) < np.inf:
+        raise CalibrationError(
+            f"{capture.name}: the exposure of its off image is {capture.off_exposure_s} s, needs a positive number"
+        )
     rays = rig.left.pixel_rays()
     known = np.isfinite(capture.depth_m) & (np.nan_to_num(capture.depth_m) > 0)
     known &= True if capture.mask is None else capture.mask
@@ -141,7 +155,8 @@ def _on_plane(
         # 1/z = plane . ray: linear, and the noise of a stereo pair is even in 1/z
         plane = np.linalg.lstsq(chosen * weight[:, None], inverse * weight, rcond=None)[0]
         error = np.abs(chosen @ plane - inverse)
-        weight = np.sqrt(np.minimum(1.0, HUBER * 1.4826 * np.median(error) / np.maximum(error, 1e-12)))
+        limit = max(HUBER * 1.4826 * float(np.median(error)), ROUNDING * float(inverse.max()))
+        weight = np.sqrt(np.minimum(1.0, limit / np.maximum(error, limit)))
     distance = np.abs(1.0 - capture.depth_m[known] * (chosen @ plane)) / np.linalg.norm(plane)
     # the mean of the inner 95 %: a median would not see a second surface
     rms_m = float(np.sqrt(np.mean(np.sort(np.square(distance))[: int(0.95 * len(distance))])))

@@ -190,7 +190,7 @@ def _notes(problem: Problem, best: Point, limits: Mapping[str, tuple[float, floa
             notes[name] = f"{name} not identifiable: {why}"
     low, high = limits["n"]
     if limits["k_s"][0] <= 0.0:
-        kind = "absorbing" if absorbing else "matte"
+        kind = "absorbing" if absorbing else "no highlight looked at" if nearest > NEAR_MIRROR_DEG else "matte"
         notes["n"] = (
             f"{kind}: n not identifiable, k_s may be 0 and is at most {limits['k_s'][1]:.2g} if n is at most "
             f"{high:.3g}, above which a lobe falls between the samples"

@@ -115,13 +115,13 @@ class CaptureSamples:
     materials
         By label; a material without usable pixels has no entry.
     registration
-        How image and depth fit, as a whole and by quarters; empty where there was nothing to compare.
+        How image and depth fit; None where there was nothing to compare.
     warnings
         What a reader should know.
     """
 
     materials: Mapping[int, MaterialSamples]
-    registration: tuple[Registration, ...]
+    registration: Registration | None
     warnings: tuple[str, ...]
 
 
@@ -177,7 +177,7 @@ def reflectance_samples(
         found.append(surface.right(kept & lit, finite, white, off, response))
     warnings = {
         "image and depth could not be compared well enough to notice that the camera moved by 3 px": (
-            not registration or not registration[0].conclusive
+            registration is None or not registration.conclusive
         ),
         "no capture with the projector off: the room's light counts as the projector's": off is None,
     }
@@ -197,7 +197,7 @@ def _validate(white: Exposed, scene: SprayedScene, rig: StereoRig, off: Exposed 
     for name, image in images.items():
         if image is not None and image.shape[:2] != wanted:
             raise CalibrationError(
-                f"{name}: is {image.shape[1]}x{image.shape[0]} px, the camera has {wanted[1]}x{wanted[0]}"
+                f"{name}: is {image.shape[1]}x{image.shape[0]} px, the camera has {wanted[1]}x{wanted[0]} px"
             )
     for name, capture in (("white", white), ("off", off)):
         if capture is not None and not 0 < capture.exposure_s < np.inf:

@@ -48,8 +48,8 @@ def search_bounds(samples: ReflectanceSamples, tilt_sigma_rad: float) -> tuple[F
     """Return the bounds (6,) of the parameters that these samples can tell apart.
 
     A lobe that falls between the samples, or is far narrower than the error of the normals, may be as high as one
-    likes. So n ends where the fourth nearest sample gets a twentieth of the peak (a ten thousandth, where that sample is
-    far: nothing then speaks against a lobe), or where a lobe is a seventh as wide as the error of the mirror ray.
+    likes. So n ends where the fourth nearest sample gets a twentieth of the peak (a ten thousandth where it is far:
+    nothing then speaks against a lobe), or where a lobe is a seventh as wide as the error of the mirror ray.
     """
     nearest = float(np.partition(samples.alpha_rad, NEAREST)[NEAREST])
     width_squared = max(nearest**2, 0.5 * float(np.median(np.square(samples.normal_sigma_rad))))

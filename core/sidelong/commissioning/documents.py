@@ -224,6 +224,6 @@ def read_document(path: Path) -> Document:
 def _version(content: bytes) -> Any:
     try:
         about: Any = json.loads(content)
-    except ValueError:
-        return None
+    except (ValueError, RecursionError):
+        return None  # what is wrong with it the validation says
     return about.get("version") if isinstance(about, dict) else None  # pyright: ignore[reportUnknownVariableType, reportUnknownMemberType]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from pydantic import ValidationError
 
 from sidelong.calibration.hand_eye.board import BoardSettings
@@ -13,6 +14,9 @@ from sidelong.commissioning.tasks import HandEyeTask
 from sidelong.errors import CalibrationError
 from sidelong.recorded.captures import BoardCaptures
 from sidelong.types import FloatArray
+
+FARTHEST_CAMERA_M = 1.5
+"""Off the flange; no bracket is that long."""
 
 
 def make_hand_eye(task: HandEyeTask, captures: Captures, progress: Progress) -> Made:
@@ -33,7 +37,19 @@ def make_hand_eye(task: HandEyeTask, captures: Captures, progress: Progress) -> 
     result = hand_eye_from_images(
         recorded.images, recorded.names, recorded.base_T_flanges, captures.dataset.rig.left, _board(recorded), told
     )
+    _check_mount(result, recorded)
     return Made(_document(task, captures, recorded, result), draw_hand_eye(result), _summary(result))
+
+
+def _check_mount(result: HandEye, recorded: BoardCaptures) -> None:
+    """Refuse a camera far off the flange: where all poses are as far from the board, another scale fits as well."""
+    distance_m = float(np.linalg.norm(result.flange_T_camera[:3, 3]))
+    if distance_m > FARTHEST_CAMERA_M:
+        board_file, poses_file = recorded.files[:2]
+        raise CalibrationError(
+            f"{poses_file}: the camera would sit {distance_m * 1e3:.4g} mm off the flange, limit "
+            f"{FARTHEST_CAMERA_M * 1e3:g} mm: check unit there, and square_m in {board_file.name}"
+        )
 
 
 def _board(recorded: BoardCaptures) -> BoardSettings:

@@ -23,12 +23,15 @@ from sidelong.commissioning.documents import LightUsed, MaterialDocument
 from sidelong.commissioning.made import Captures, Made, Progress, parameter
 from sidelong.commissioning.material_picture import draw_material
 from sidelong.commissioning.tasks import MaterialTask
-from sidelong.errors import CalibrationError
+from sidelong.errors import CalibrationError, DepthError
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.raycast import RayScene
 from sidelong.planning.light import DEFAULT_INTENSITY, LightSettings
 from sidelong.recorded.captures import SprayedCapture
 from sidelong.types import GrayImage, IntArray
+
+DARK_GREY, LEAST_LIT = 5, 1e-3
+"""Grey levels above the dark image that are light, and the share of such pixels in a capture that shows something."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,7 @@ class _Seen:
 
     part: Part
     capture: SprayedCapture
+    labels: IntArray
     white: WhiteImage
     light: LightSettings
     projector: ProjectorLight
@@ -56,7 +60,7 @@ def make_materials(task: MaterialTask, captures: Captures, progress: Progress) -
     progress("samples", 0, 1)
     seen = _see(captures)
     progress("samples", 1, 1)
-    wanted = _wanted(task, seen.part, seen.samples)
+    wanted = _wanted(task, seen)
     for done, index in enumerate(wanted):
         progress("materials", done, len(wanted))
         yield _made(captures, seen, index)
@@ -70,14 +74,19 @@ def _see(captures: Captures) -> _Seen:
     capture, rig = captures.recorded.sprayed(), captures.dataset.rig
     part, light = captures.dataset.part(captures.object), captures.settings().light
     projector = ProjectorLight(light.intensity or DEFAULT_INTENSITY, light.fall_off, light.vignetting)
-    normals = estimate_normals(capture.depth_m, rig.left)
+    labels = _labels(capture, captures, part)
+    try:
+        normals = estimate_normals(capture.depth_m, rig.left)
+    except DepthError as error:
+        raise CalibrationError(f"{capture.files[0].with_name('DEPTH_sprayed.png')}: {error}") from error
     scene = SprayedScene(
         depth_m=capture.depth_m,
         normals_camera=normals.normals_camera,
         normal_sigma_rad=normals.sigma_rad,
-        labels=_labels(capture, captures, part),
+        labels=labels,
     )
     white = _white(capture.left)
+    _check_lit(white.image, capture)
     right = _white(capture.right).image if capture.right else None
     room = capture.room
     samples = reflectance_samples(
@@ -88,7 +97,7 @@ def _see(captures: Captures) -> _Seen:
         projector,
         off=None if room is None else Exposed(room.left, room.right, room.exposure_s),
     )
-    return _Seen(part, capture, white, light, projector, samples)
+    return _Seen(part, capture, labels, white, light, projector, samples)
 
 
 def _white(images: tuple[GrayImage, ...]) -> WhiteImage:
@@ -96,6 +105,19 @@ def _white(images: tuple[GrayImage, ...]) -> WhiteImage:
     for image in images:
         pattern.add(image)
     return pattern.result()
+
+
+def _check_lit(white: GrayImage, capture: SprayedCapture) -> None:
+    """Refuse an image without the projector's light: all materials would seem to absorb it."""
+    room = capture.room
+    beside = room.left if room is not None and room.exposure_s == capture.exposure_s else np.zeros_like(white)
+    lit = white.astype(np.intp) - beside > DARK_GREY
+    if lit.mean() < LEAST_LIT:
+        raise CalibrationError(
+            f"{capture.files[0]}: at {capture.exposure_s * 1e3:g} ms {int(lit.sum())} of {lit.size} px are more than "
+            f"{DARK_GREY} grey levels brighter than without the projector, needs {LEAST_LIT:.1%}: did it show the "
+            "white pattern? Expose longer"
+        )
 
 
 def _labels(capture: SprayedCapture, captures: Captures, part: Part) -> IntArray:
@@ -118,11 +140,16 @@ def _labels(capture: SprayedCapture, captures: Captures, part: Part) -> IntArray
     return np.where(mask, 0, -1).astype(np.intp)
 
 
-def _wanted(task: MaterialTask, part: Part, samples: CaptureSamples) -> list[int]:
+def _wanted(task: MaterialTask, seen: _Seen) -> list[int]:
+    part, samples = seen.part, seen.samples
     known = [index for index in range(len(part.materials)) if index in samples.materials]
     if task.material is None:
         if not known:
-            raise CalibrationError(f"{part.name}: no material has a usable pixel: depth, normals and light are needed")
+            raise CalibrationError(
+                f"{part.name}: no material has a usable pixel: of {int((seen.labels >= 0).sum())} px on parts "
+                f"{int((seen.labels >= 0)[np.isfinite(seen.capture.depth_m)].sum())} have depth, and none of these is "
+                "lit, has a normal and lies off the edges: look from nearer, or at a larger part"
+            )
         return known
     if task.material not in part.materials:
         raise CalibrationError(f"material: {task.material!r} is none of {part.name}'s: {', '.join(part.materials)}")

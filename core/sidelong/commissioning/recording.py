@@ -87,7 +87,7 @@ class Recorder:
         lit, dark = self._frame(Projector.WHITE, exposure_s), self._frame(Projector.OFF, exposure_s)
         depth = self._depth_frame(exposure_s)
         folder = self._folder("Plane")
-        index = len(list(folder.glob("LEFT_white_*.bmp")))
+        index = _next_index(folder, "LEFT_white_")
         picture = folder / f"DEPTH_{index}.png"
         self._write_depth(picture, depth)
         # the white image last: by it captures are known
@@ -100,7 +100,7 @@ class Recorder:
         Raises as ``bracket``.
         """
         frame, folder = self._frame(projector, exposure_s), self._folder("HandEye")
-        image = folder / f"LEFT_{len(list(folder.glob('LEFT_*.bmp')))}.bmp"
+        image = folder / f"LEFT_{_next_index(folder, 'LEFT_')}.bmp"
         write_gray(image, frame.left)
         add_to_json(folder / "poses.json", "poses", **{image.name: pose_to_mm(self.base_T_flange)})
         return (image,)
@@ -136,3 +136,9 @@ class Recorder:
         folder = (self.root / self.object if self.object else self.root) / "Calibration" / kind
         folder.mkdir(parents=True, exist_ok=True)
         return folder
+
+
+def _next_index(folder: Path, beginning: str) -> int:
+    """Return a number that no image has, though some of them may have been deleted."""
+    endings = (file.stem.removeprefix(beginning) for file in folder.glob(f"{beginning}*.bmp"))
+    return 1 + max((int(ending) for ending in endings if ending.isdecimal()), default=-1)
