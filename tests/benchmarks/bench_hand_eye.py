@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "core" / "calibration"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "core" / "calibration" / "hand_eye"))
 
 from hand_eye_scene import BOARD, CAMERA, Noise, camera_T_board, error, exact_arm, scene, small_motion
 

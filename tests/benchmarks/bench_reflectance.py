@@ -23,13 +23,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "core" / "calibration"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "core" / "calibration" / "reflectance"))
 
 from reflectance_scene import Flaws, capture, cosines
 
-from sidelong.calibration.phong_fit import fit_two_stage
-from sidelong.calibration.reflectance_fit import ReflectanceSettings, fit_reflectance
-from sidelong.calibration.reflectance_model import ReflectanceSamples
+from sidelong.calibration.reflectance.fit import ReflectanceSettings, fit_reflectance
+from sidelong.calibration.reflectance.model import ReflectanceSamples
+from sidelong.calibration.reflectance.two_stages import fit_two_stage
 from sidelong.errors import InputError
 from sidelong.physics.reflectance import PAPER_MATERIALS, Phong
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from sidelong.calibration.light_fit import fit_intensity
+from sidelong.calibration.projector.white_image import fit_intensity
 from sidelong.calibration.sensing.fit import fit_sensing
 from sidelong.calibration.sensing.samples import SensingSamples, samples_of
 from sidelong.calibration.sensing.scores import scores_of

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from service_process import QUICK_RECIPE, ServiceProcess, small_cell
 
-from sidelong.calibration.light_fit import fit_intensity
+from sidelong.calibration.projector.white_image import fit_intensity
 from sidelong.planning.light import DEFAULT_INTENSITY
 from sidelong.recipe import Recipe, light_model
 from sidelong.recorded.dataset import Dataset

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-from sidelong.calibration.reflectance_result import Parameter as FittedParameter
+from sidelong.calibration.reflectance.result import Parameter as FittedParameter
 from sidelong.commissioning.applied import calibrated
 from sidelong.commissioning.documents import Document, InputFile, Parameter, hashed
 from sidelong.recipe import Recipe

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from sidelong.calibration.normals import estimate_normals
-from sidelong.calibration.reflectance_fit import fit_reflectance
-from sidelong.calibration.reflectance_result import ReflectanceFit
-from sidelong.calibration.reflectance_samples import (
+from sidelong.calibration.reflectance.fit import fit_reflectance
+from sidelong.calibration.reflectance.result import ReflectanceFit
+from sidelong.calibration.reflectance.samples import (
     CaptureSamples,
     Exposed,
     MaterialSamples,
     ProjectorLight,
     reflectance_samples,
 )
-from sidelong.calibration.sprayed_scene import SprayedScene
+from sidelong.calibration.reflectance.sprayed_scene import SprayedScene
 from sidelong.calibration.white_pattern import WhiteImage, WhitePattern
 from sidelong.commissioning.documents import LightUsed, MaterialDocument
 from sidelong.commissioning.made import Captures, Made, Progress, parameter

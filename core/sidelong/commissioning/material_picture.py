@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from sidelong.calibration.reflectance_fit import usable_samples
-from sidelong.calibration.reflectance_model import ReflectanceSamples
-from sidelong.calibration.reflectance_result import ReflectanceFit
-from sidelong.calibration.reflectance_samples import MaterialSamples
+from sidelong.calibration.reflectance.fit import usable_samples
+from sidelong.calibration.reflectance.model import ReflectanceSamples
+from sidelong.calibration.reflectance.result import ReflectanceFit
+from sidelong.calibration.reflectance.samples import MaterialSamples
 from sidelong.commissioning.figures import png, show_map
 from sidelong.physics.reflectance import Phong, lambert, mirrored, specular
 from sidelong.physics.response import Response

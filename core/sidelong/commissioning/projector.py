@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from sidelong.calibration.matte_plane import PlaneCapture
-from sidelong.calibration.projector_fit import ProjectorFit, fit_projector
-from sidelong.calibration.reflectance_result import Parameter as FittedParameter
+from sidelong.calibration.projector.fit import ProjectorFit, fit_projector
+from sidelong.calibration.projector.matte_plane import PlaneCapture
+from sidelong.calibration.reflectance.result import Parameter as FittedParameter
 from sidelong.commissioning.documents import ProjectorDocument
 from sidelong.commissioning.figures import png, show_map
 from sidelong.commissioning.made import Captures, Made, Progress, parameter

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sidelong.calibration.light_fit import fit_intensity
+from sidelong.calibration.projector.white_image import fit_intensity
 from sidelong.geometry.mesh import Part
 from sidelong.planning.light import DEFAULT_INTENSITY
 from sidelong.recipe import Recipe, light_model

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sidelong.calibration.light_fit import fit_intensity
+from sidelong.calibration.projector.white_image import fit_intensity
 from sidelong.devices import CaptureRequest
 from sidelong.errors import InputError
 from sidelong.geometry.transforms import look_at

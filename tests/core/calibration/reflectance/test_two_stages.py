@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sidelong.calibration.phong_fit import fit_two_stage
+from sidelong.calibration.reflectance.two_stages import fit_two_stage
 from sidelong.errors import InputError
 from sidelong.physics.reflectance import PAPER_MATERIALS, Phong
 

@@ -18,7 +18,7 @@ def fit_two_stage(radiance: FloatArray, light: FloatArray, cos_theta: FloatArray
 
     This is the paper's method to the letter. Its second stage takes logarithms of a difference near zero, so it is
     exact on clean data and biased by noise: at 0.2 % noise k_s of 0.74 comes out near 0.01. It is the baseline that
-    :mod:`sidelong.calibration.reflectance_fit` is measured against.
+    :mod:`sidelong.calibration.reflectance.fit` is measured against.
 
     Parameters
     ----------

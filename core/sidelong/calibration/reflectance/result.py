@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from sidelong.calibration.reflectance_model import MirrorGeometry, ReflectanceSamples
-from sidelong.calibration.reflectance_solver import K_D, K_S, LOG_N, TILT, Point, Problem
+from sidelong.calibration.reflectance.model import MirrorGeometry, ReflectanceSamples
+from sidelong.calibration.reflectance.solver import K_D, K_S, LOG_N, TILT, Point, Problem
 from sidelong.physics.reflectance import Phong
 from sidelong.physics.response import Response
 from sidelong.types import BoolArray, FloatArray

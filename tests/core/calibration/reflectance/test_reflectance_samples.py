@@ -8,15 +8,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sidelong.calibration.reflectance_fit import fit_reflectance
-from sidelong.calibration.reflectance_samples import (
+from sidelong.calibration.reflectance.fit import fit_reflectance
+from sidelong.calibration.reflectance.registration import check_registration
+from sidelong.calibration.reflectance.samples import (
     Exposed,
     ProjectorLight,
     SampleSettings,
     SprayedScene,
     reflectance_samples,
 )
-from sidelong.calibration.registration import check_registration
 from sidelong.errors import CalibrationError
 from sidelong.geometry.camera_model import LightProjector, PinholeCamera, StereoRig
 from sidelong.geometry.mesh import Part, part_from_arrays

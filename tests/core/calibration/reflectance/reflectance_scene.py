@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sidelong.calibration.reflectance_model import ReflectanceSamples, stacked
+from sidelong.calibration.reflectance.model import ReflectanceSamples, stacked
 from sidelong.geometry.transforms import rotation_about
 from sidelong.physics.reflectance import Phong, mirrored, radiance, specular
 

@@ -13,9 +13,9 @@ from types import MappingProxyType
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from sidelong.calibration.reflectance_model import ReflectanceSamples, stacked
-from sidelong.calibration.registration import Registration, check_registration
-from sidelong.calibration.sprayed_scene import SprayedScene, projector_camera, sound_pixels, unhidden
+from sidelong.calibration.reflectance.model import ReflectanceSamples, stacked
+from sidelong.calibration.reflectance.registration import Registration, check_registration
+from sidelong.calibration.reflectance.sprayed_scene import SprayedScene, projector_camera, sound_pixels, unhidden
 from sidelong.errors import CalibrationError
 from sidelong.geometry.camera_model import StereoRig
 from sidelong.geometry.transforms import invert, transform_points

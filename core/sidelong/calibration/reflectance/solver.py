@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-from sidelong.calibration.reflectance_model import MirrorGeometry, ReflectanceSamples
+from sidelong.calibration.reflectance.model import MirrorGeometry, ReflectanceSamples
 from sidelong.types import BoolArray, FloatArray
 
 LOG_N, K_D, K_S, TILT = 0, 1, 2, slice(3, 6)

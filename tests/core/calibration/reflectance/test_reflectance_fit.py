@@ -13,9 +13,9 @@ from reflectance_scene import BASELINE_RAD, Flaws, capture, cosines, hemisphere,
 from scipy.optimize import least_squares
 from scipy.stats import binom
 
-from sidelong.calibration.phong_fit import fit_two_stage
-from sidelong.calibration.reflectance_fit import ReflectanceFit, ReflectanceSettings, fit_reflectance
-from sidelong.calibration.reflectance_model import MirrorGeometry, ReflectanceSamples, expected_normals
+from sidelong.calibration.reflectance.fit import ReflectanceFit, ReflectanceSettings, fit_reflectance
+from sidelong.calibration.reflectance.model import MirrorGeometry, ReflectanceSamples, expected_normals
+from sidelong.calibration.reflectance.two_stages import fit_two_stage
 from sidelong.errors import CalibrationError
 from sidelong.physics.reflectance import PAPER_MATERIALS, Phong
 from sidelong.physics.response import Response

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.stats import binom
 
-from sidelong.calibration.matte_plane import PlaneCapture, ProjectorFitSettings
-from sidelong.calibration.projector_fit import ProjectorFit, fit_projector
-from sidelong.calibration.reflectance_samples import ProjectorLight
+from sidelong.calibration.projector.fit import ProjectorFit, fit_projector
+from sidelong.calibration.projector.matte_plane import PlaneCapture, ProjectorFitSettings
+from sidelong.calibration.reflectance.samples import ProjectorLight
 from sidelong.errors import CalibrationError
 from sidelong.geometry.camera_model import LightProjector, PinholeCamera, StereoRig
 from sidelong.geometry.mesh import part_from_arrays

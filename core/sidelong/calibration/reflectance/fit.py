@@ -1,9 +1,9 @@
 """Phong reflectance of a material from samples: robust, with intervals, and honest about what was not measured.
 
-The paper's two stages (:mod:`sidelong.calibration.phong_fit`) take logarithms of differences near zero and are biased
-by noise. Here [n, k_d, k_s] are fitted to the radiance itself: weighted by noise and by the error of the normals,
-saturated and dark samples as bounds, outliers bounded. Assumed: normals err by independent noise of known size and by
-one common tilt, and their true directions are spread smoothly.
+The paper's two stages (:mod:`sidelong.calibration.reflectance.two_stages`) take logarithms of differences near zero and
+are biased by noise. Here [n, k_d, k_s] are fitted to the radiance itself: weighted by noise and by the error of the
+normals, saturated and dark samples as bounds, outliers bounded. Assumed: normals err by independent noise of known size
+and by one common tilt, and their true directions are spread smoothly.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from sidelong.calibration.reflectance_model import ReflectanceSamples, expected_normals
-from sidelong.calibration.reflectance_result import Found, ReflectanceFit, judged_by, model_of, report
-from sidelong.calibration.reflectance_solver import (
+from sidelong.calibration.reflectance.model import ReflectanceSamples, expected_normals
+from sidelong.calibration.reflectance.result import Found, ReflectanceFit, judged_by, model_of, report
+from sidelong.calibration.reflectance.solver import (
     K_D,
     K_S,
     LOG_N,

@@ -12,8 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sidelong.calibration.matte_plane import HUBER, ROUNDS, PlaneCapture, PlaneRows, ProjectorFitSettings, plane_rows
-from sidelong.calibration.reflectance_result import Parameter
+from sidelong.calibration.projector.matte_plane import (
+    HUBER,
+    ROUNDS,
+    PlaneCapture,
+    PlaneRows,
+    ProjectorFitSettings,
+    plane_rows,
+)
+from sidelong.calibration.reflectance.result import Parameter
 from sidelong.errors import CalibrationError
 from sidelong.geometry.camera_model import StereoRig
 from sidelong.physics.response import Response
