@@ -31,6 +31,7 @@ Exposure = Annotated[float, typer.Option("--exposure-ms", min=1e-3, max=1e4)]
 Shown = Annotated[Projector, typer.Option(help="What the projector shows.")]
 PROJECTOR_ON_MS, PROJECTOR_OFF_MS = 12.0, 200.0
 BRACKET_MS = "3,6,12,25,50,100,200,400,800"
+WHITE_MS = "12,3,0.75"
 FEWEST_EXPOSURES = 3
 
 
@@ -47,7 +48,7 @@ def bracket(
 ) -> None:
     """Take an exposure bracket of the scene: for `sidelong calibrate response`."""
     with plain_errors():
-        exposures_s = [_milliseconds(each) for each in exposures_ms.split(",") if each.strip()]
+        exposures_s = _exposures_s(exposures_ms)
         if len(set(exposures_s)) < FEWEST_EXPOSURES:
             raise CommandError(f"--exposures-ms: {exposures_ms!r:.80} has fewer than {FEWEST_EXPOSURES} exposures")
         with CountedProgress(err) as progress:
@@ -61,14 +62,17 @@ def bracket(
 @record.command()
 def white(
     root: Root,
-    exposure_ms: Exposure = PROJECTOR_ON_MS,
+    exposures_ms: Annotated[
+        str, typer.Option("--exposures-ms", help="That of depth captures first; shorter ones measure highlights.")
+    ] = WHITE_MS,
     object_name: Object = None,
     view: ViewName = None,
     config: ConfigFile = None,
 ) -> None:
     """Take images under the white pattern: with `record sprayed` for `sidelong calibrate material`."""
     with plain_errors():
-        _record(config, root, object_name, view, lambda recorder: recorder.white(exposure_ms * 1e-3))
+        exposures_s = _exposures_s(exposures_ms)
+        _record(config, root, object_name, view, lambda recorder: recorder.white(exposures_s))
 
 
 @record.command()
@@ -169,8 +173,14 @@ def _record(
             out.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
 
 
-def _milliseconds(text: str) -> float:
-    try:
-        return float(text) * 1e-3
-    except ValueError as error:
-        raise CommandError(f"--exposures-ms: {text!r:.40} is no number") from error
+def _exposures_s(text: str) -> list[float]:
+    """Read milliseconds divided by commas. Raises CommandError."""
+    exposures: list[float] = []
+    for each in filter(None, (part.strip() for part in text.split(","))):
+        try:
+            exposures.append(float(each) * 1e-3)
+        except ValueError as error:
+            raise CommandError(f"--exposures-ms: {each!r:.40} is no number") from error
+    if not exposures:
+        raise CommandError(f"--exposures-ms: {text!r:.40} names none, needs at least one")
+    return exposures

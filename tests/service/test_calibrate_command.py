@@ -1,7 +1,11 @@
-"""``sidelong record`` and ``sidelong calibrate`` as a user types them: from captures to a file that a scan uses."""
+"""``sidelong record`` and ``sidelong calibrate`` as a user types them: from captures to a file that a scan uses.
+
+One of each kind is a process of its own; the many refusals run in this one, which has its libraries loaded.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -14,11 +18,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from click.testing import Result
 from PIL import Image
+from typer.testing import CliRunner
 
 from sidelong.commissioning.documents import Document, read_document, to_json
 from sidelong.recorded.captures import CalibrationCaptures
 from sidelong.recorded.dataset import Dataset
+from sidelong_service.cli import app
 
 ROBI = Path(__file__).parents[1] / "data" / "robi"
 RECIPE = {"detection": {"view_step_deg": 40, "roll_step_deg": 30}, "planning": {"max_views": 1}}
@@ -32,18 +39,35 @@ def sidelong(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def succeeded(folder: Path, *arguments: str) -> list[str]:
-    """Run a command and return the lines it printed."""
+    """Run a command in a process of its own and return the lines it printed."""
     done = sidelong(folder, *arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
 
-def refused(folder: Path, *arguments: str) -> str:
+def here(folder: Path, *arguments: str) -> Result:
+    """Run a command in this process."""
+    with contextlib.chdir(folder):
+        return CliRunner().invoke(app, arguments)
+
+
+def succeeded_here(folder: Path, *arguments: str) -> list[str]:
+    done = here(folder, *arguments)
+    assert done.exit_code == 0, (done.exception, done.stderr)
+    return done.stdout.splitlines()
+
+
+def refused_here(folder: Path, *arguments: str) -> str:
     """Run a command that cannot work and return its one line."""
-    done = sidelong(folder, *arguments)
-    assert done.returncode == 1, (done.stdout, done.stderr)
-    lines = [line for line in done.stderr.splitlines() if line]
-    assert len(lines) == 1, done.stderr
+    done = here(folder, *arguments)
+    assert isinstance(done.exception, SystemExit), done.exception
+    assert done.exit_code == 1
+    return one_line(done.stderr)
+
+
+def one_line(told: str) -> str:
+    lines = [line for line in told.splitlines() if line]
+    assert len(lines) == 1, told
     assert lines[0].startswith("error: ")
     return lines[0]
 
@@ -100,7 +124,9 @@ def test_a_scan_with_the_calibration_names_it_in_its_report(desk: Path, response
 
 def test_a_calibration_of_another_camera_stops_a_scan_with_one_line(desk: Path, response: Path) -> None:
     arguments = ("--part", "tube_fitting", "--recipe", "recipe.json", "--calibration", str(response))
-    line = refused(desk, "scan", *arguments, "--config", "other.yaml", "--output", "nothing")
+    done = sidelong(desk, "scan", *arguments, "--config", "other.yaml", "--output", "nothing")
+    assert done.returncode == 1
+    line = one_line(done.stderr)
     assert line.endswith("is of device 'simulated', the camera is 'other'")
     assert not (desk / "nothing").exists()
 
@@ -109,22 +135,24 @@ def test_a_calibration_that_was_changed_is_refused(desk: Path, response: Path) -
     content = json.loads(response.read_text()) | {"samples": 7}
     (desk / "changed.json").write_text(json.dumps(content))
     for command in (("scan", "--part", "tube_fitting"), ("calibrate", "projector", "data-set", "--plane-k-d", "0.5")):
-        assert "changed.json: was changed after it was written" in refused(
+        assert "changed.json: was changed after it was written" in refused_here(
             desk, *command, "--calibration", "changed.json"
         )
 
 
 def test_white_sprayed_plane_and_board_are_recorded_where_they_are_read(desk: Path) -> None:
     at_view = ("--view", "e70_a90", "--config", "cell.yaml")
-    for kind in ("white", "sprayed"):
-        succeeded(desk, "record", kind, "captured", "--object", "tube_fitting", "--exposure-ms", "6", *at_view)
-    succeeded(desk, "record", "plane", "captured", *at_view)
-    succeeded(desk, "record", "board", "captured", "--config", "cell.yaml", "--board", "board.json")
+    named = ("captured", "--object", "tube_fitting", *at_view)
+    succeeded_here(desk, "record", "white", *named, "--exposures-ms", "6,1.5")
+    succeeded_here(desk, "record", "sprayed", *named, "--exposure-ms", "6")
+    succeeded_here(desk, "record", "plane", "captured", *at_view)
+    succeeded_here(desk, "record", "board", "captured", "--config", "cell.yaml", "--board", "board.json")
     lines = succeeded(desk, "record", "board", "captured", *at_view)
     assert lines == ["  captured/Calibration/HandEye/LEFT_1.bmp"]
     captures = CalibrationCaptures(Dataset(desk / "captured"), "tube_fitting")
     sprayed = captures.sprayed()
     assert sprayed.exposure_s == pytest.approx(0.006)
+    assert [pair.exposure_s for pair in sprayed.others] == pytest.approx([0.0015])
     assert sprayed.room is not None
     assert np.isfinite(sprayed.depth_m).mean() > 0.3
     (plane,), _ = captures.planes()
@@ -142,10 +170,11 @@ def test_white_sprayed_plane_and_board_are_recorded_where_they_are_read(desk: Pa
     [
         (("bracket", "data-set", "--view", "nowhere"), "--view: 'nowhere' is unknown, known are top, e70_a0"),
         (("bracket", "data-set", "--exposures-ms", "3,x,4"), "--exposures-ms: 'x' is no number"),
-        (("bracket", "data-set", "--exposures-ms", ""), "has fewer than 3 exposures"),
+        (("bracket", "data-set", "--exposures-ms", ""), "'' names none, needs at least one"),
         (("bracket", "data-set", "--exposures-ms", "3,6,3.0"), "'3,6,3.0' has fewer than 3 exposures"),
         (("bracket", "data-set", "--exposures-ms", "3,nan,6"), "exposure is nan s, limits"),
         (("bracket", "data-set", "--exposures-ms", "3,6,20000"), "exposure is 20.0 s, limits 1e-06 to 10 s"),
+        (("white", "data-set", "--exposures-ms", " , "), "' , ' names none, needs at least one"),
         (("board", "data-set", "--board", "missing.json"), "--board: missing.json is no file"),
         (("white", "data-set", "--object", "../elsewhere"), "--object: '../elsewhere' is no name of an object"),
     ],
@@ -154,13 +183,13 @@ def test_a_recording_that_cannot_be_made_leaves_the_one_that_is_there(
     desk: Path, response: Path, arguments: tuple[str, ...], message: str
 ) -> None:
     before = contents(desk)
-    assert message in refused(desk, "record", *arguments, "--config", "cell.yaml")
+    assert message in refused_here(desk, "record", *arguments, "--config", "cell.yaml")
     assert contents(desk) == before
 
 
 def test_a_data_set_of_another_camera_is_not_recorded_into(desk: Path) -> None:
     before = contents(desk)
-    line = refused(desk, "record", "white", "data-set", "--config", "other.yaml")
+    line = refused_here(desk, "record", "white", "data-set", "--config", "other.yaml")
     assert "data-set: holds recordings of camera simulated, this one is other" in line
     assert contents(desk) == before
 
@@ -182,7 +211,7 @@ def test_a_data_set_of_another_camera_is_not_recorded_into(desk: Path) -> None:
 def test_what_cannot_be_calibrated_is_one_line_and_leaves_no_file(
     desk: Path, arguments: tuple[str, ...], message: str
 ) -> None:
-    assert message in refused(desk, "calibrate", *arguments, "--output", "nothing-made")
+    assert message in refused_here(desk, "calibrate", *arguments, "--output", "nothing-made")
     assert not (desk / "nothing-made").exists()
 
 
@@ -191,25 +220,27 @@ def test_what_cannot_be_calibrated_is_one_line_and_leaves_no_file(
     [
         (("calibrate", "projector", "data-set"), "Missing option '--plane-k-d'"),
         (("calibrate", "projector", "data-set", "--plane-k-d", "2"), "less than or equal to 1, got 2.0"),
-        (("record", "white", "data-set", "--exposure-ms", "0"), "'--exposure-ms'"),
+        (("record", "plane", "data-set", "--exposure-ms", "0"), "'--exposure-ms'"),
     ],
 )
 def test_options_out_of_range_are_told_with_the_usage(desk: Path, arguments: tuple[str, ...], message: str) -> None:
-    done = sidelong(desk, *arguments)
-    assert done.returncode == 2
+    done = here(desk, *arguments)
+    assert done.exit_code == 2
     assert "Usage:" in done.stderr
     assert message in " ".join(done.stderr.split())
 
 
 @pytest.fixture(scope="module")
 def robi_response(desk: Path) -> Path:
-    lines = succeeded(desk, "calibrate", "response", str(ROBI), "--object", "Tube_fitting", "--output", "robi-made")
+    lines = succeeded_here(
+        desk, "calibrate", "response", str(ROBI), "--object", "Tube_fitting", "--output", "robi-made"
+    )
     return desk / lines[0].strip()
 
 
 def test_a_calibration_builds_on_those_that_are_named(desk: Path, robi_response: Path) -> None:
     arguments = (str(ROBI), "--object", "Tube_fitting", "--calibration", str(robi_response))
-    lines = succeeded(desk, "calibrate", "material", *arguments, "--output", "robi-made")
+    lines = succeeded_here(desk, "calibrate", "material", *arguments, "--output", "robi-made")
     document: Document = read_document(desk / lines[0].strip())
     assert document.uses == (read_document(robi_response).id,)
 
@@ -233,7 +264,7 @@ def test_strategies_are_compared_with_a_calibration(desk: Path, robi_response: P
     document = read_document(robi_response)
     other = document.model_copy(update={"device_serial": "other"}).sealed()
     (desk / "foreign.json").write_bytes(to_json(other))
-    line = refused(desk, "compare", str(ROBI), *quick, "--calibration", "foreign.json", "--plot", "b.png")
+    line = refused_here(desk, "compare", str(ROBI), *quick, "--calibration", "foreign.json", "--plot", "b.png")
     assert f"calibration {other.id}: is of device 'other', the camera is 'intrinsics-" in line
     assert not (desk / "b.png").exists()
 

@@ -18,6 +18,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+from sidelong.calibration.depth_noise import noise_blur_px
 from sidelong.calibration.window_planes import PLANE_PARAMETERS, Method, Planes, fit_planes
 from sidelong.errors import DepthError, ImageError, SettingsError
 from sidelong.geometry.camera_model import PinholeCamera
@@ -30,6 +31,11 @@ RESIDUAL_NOISE = 2.0
 SMOOTHED_SIGMA = 3.0
 """Error over sigma per pixel of smoothing, where noise is taken as independent: 2.9 to 3.3 times the blur, measured for
 blurs of 0.7 to 2 px and windows of 3 to 9 px."""
+
+
+WINDOWS_PX = (5, 9, 15)
+LEAST_SIGMA_RAD = 2e-3
+"""No normal counts for more than one of a tenth of a degree: a flat patch of a quantised map may state 0."""
 
 
 class NormalSettings(BaseModel):
@@ -129,6 +135,45 @@ def estimate_normals(depth_m: FloatArray, camera: PinholeCamera, settings: Norma
         usable = np.isfinite(inverse) & ~_near_edges(inverse, camera, settings)
         planes = fit_planes(inverse, usable, camera, settings.method, settings.radius_px, settings.fewest_points)
         return _judged(planes, inverse, camera, settings)
+
+
+def informative_normals(
+    depth_m: FloatArray, camera: PinholeCamera, where: BoolArray, windows_px: tuple[int, ...] = WINDOWS_PX
+) -> tuple[NormalMap, NormalSettings]:
+    """Estimate normals with the window that suits the noise of the depth map, and return them with its settings.
+
+    A small window keeps more pixels of small parts, a large one averages more noise: the window is taken whose normals
+    carry most information on the pixels of interest, the sum of 1 / sigma^2. How far the noise reaches from pixel to
+    pixel is estimated from the map itself.
+
+    Parameters
+    ----------
+    depth_m, camera
+        As in :func:`estimate_normals`.
+    where
+        (H, W) pixels of interest.
+    windows_px
+        Windows to try; those that do not fit into the image are passed over.
+
+    Raises
+    ------
+    DepthError, SettingsError
+        As :func:`estimate_normals`.
+    """
+    blur_px = noise_blur_px(depth_m)
+    best: tuple[float, NormalMap, NormalSettings] | None = None
+    for window_px in windows_px:
+        if best is not None and window_px > min(depth_m.shape):
+            continue
+        settings = NormalSettings(window_px=window_px, smoothing_px=blur_px)
+        found = estimate_normals(depth_m, camera, settings)
+        sigma_rad = np.maximum(found.sigma_rad[where], LEAST_SIGMA_RAD)
+        information = float(np.nansum(sigma_rad**-2.0))
+        if best is None or information > best[0]:
+            best = information, found, settings
+    if best is None:
+        raise SettingsError("normals: windows_px names no window, needs at least one")
+    return best[1], best[2]
 
 
 def _check(depth_m: FloatArray, camera: PinholeCamera, settings: NormalSettings) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sidelong.calibration.normals import estimate_normals
+from sidelong.calibration.normals import informative_normals
 from sidelong.calibration.reflectance.fit import fit_reflectance
 from sidelong.calibration.reflectance.result import ReflectanceFit
 from sidelong.calibration.reflectance.samples import (
@@ -15,6 +15,7 @@ from sidelong.calibration.reflectance.samples import (
     Exposed,
     MaterialSamples,
     ProjectorLight,
+    joined,
     reflectance_samples,
 )
 from sidelong.calibration.reflectance.sprayed_scene import SprayedScene
@@ -76,7 +77,7 @@ def _see(captures: Captures) -> _Seen:
     projector = ProjectorLight(light.intensity or DEFAULT_INTENSITY, light.fall_off, light.vignetting)
     labels = _labels(capture, captures, part)
     try:
-        normals = estimate_normals(capture.depth_m, rig.left)
+        normals, _ = informative_normals(capture.depth_m, rig.left, labels >= 0)
     except DepthError as error:
         raise CalibrationError(f"{capture.files[0].with_name('DEPTH_sprayed.png')}: {error}") from error
     scene = SprayedScene(
@@ -89,15 +90,11 @@ def _see(captures: Captures) -> _Seen:
     _check_lit(white.image, capture)
     right = _white(capture.right).image if capture.right else None
     room = capture.room
-    samples = reflectance_samples(
-        Exposed(white.image, right, capture.exposure_s),
-        scene,
-        rig,
-        light.response(),
-        projector,
-        off=None if room is None else Exposed(room.left, room.right, room.exposure_s),
-    )
-    return _Seen(part, capture, labels, white, light, projector, samples)
+    off = None if room is None else Exposed(room.left, room.right, room.exposure_s)
+    lit = [Exposed(white.image, right, capture.exposure_s)]
+    lit += [Exposed(other.left, other.right, other.exposure_s) for other in capture.others]
+    taken = [reflectance_samples(each, scene, rig, light.response(), projector, off) for each in lit]
+    return _Seen(part, capture, labels, white, light, projector, joined(taken))
 
 
 def _white(images: tuple[GrayImage, ...]) -> WhiteImage:

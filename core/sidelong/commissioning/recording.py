@@ -63,14 +63,23 @@ class Recorder:
         write_json(folder / "times.json", {"unit": "ms", "times": times})
         return files
 
-    def white(self, exposure_s: float) -> tuple[Path, ...]:
+    def white(self, exposures_s: Sequence[float]) -> tuple[Path, ...]:
         """Take both images under the white pattern, and with the projector off, and return their files.
+
+        The first exposure is the one of depth captures; shorter ones measure what saturates in it. Older images give
+        way.
 
         Raises as ``bracket``.
         """
-        lit, dark = self._frame(Projector.WHITE, exposure_s), self._frame(Projector.OFF, exposure_s)
+        lit = [self._frame(Projector.WHITE, exposure_s) for exposure_s in exposures_s]
+        dark = self._frame(Projector.OFF, exposures_s[0])
         folder = self._folder("Phong")
-        return (*self._write_images(folder, "white", lit), *self._write_images(folder, "off", dark))
+        for old in folder.glob("*_white_*"):
+            old.unlink()
+        files = [*self._write_images(folder, "white", lit[0]), *self._write_images(folder, "off", dark)]
+        for index, frame in enumerate(lit[1:], start=1):
+            files += self._write_images(folder, f"white_{index}", frame)
+        return tuple(files)
 
     def sprayed(self, exposure_s: float) -> tuple[Path, ...]:
         """Take the depth of the scene once it is sprayed, and return its file. Raises as ``bracket``."""

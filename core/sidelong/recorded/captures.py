@@ -6,6 +6,7 @@
       Response/times.json         exposure bracket of a scene at rest: {"unit": "ms", "times": {image: time}}
       Phong/{LEFT,RIGHT}_white.bmp .json            white pattern; exposure_ms, cam_pose (mm). Instead of each image
            /{LEFT,RIGHT}_pattern_<i>.bmp            shifted dots are merged, their exposure is in LEFT_pattern_0.json
+           /{LEFT,RIGHT}_white_<i>.bmp .json        optional: more exposures of the same
            /{LEFT,RIGHT}_off.bmp .json              optional: projector off, any exposure; the room's light
            /DEPTH_sprayed.png .json                 the same scene, sprayed: complete depth
            /mask_parts.png, GT_world2obj.json       optional: which pixels show parts; their poses (mm)
@@ -51,8 +52,8 @@ class Bracket:
 
 
 @dataclass(frozen=True, eq=False)
-class RoomLight:
-    """What the cameras see with the projector off: ``left`` (H, W), ``right`` likewise or None, ``exposure_s``."""
+class ImagePair:
+    """What the cameras see at one exposure: ``left`` (H, W), ``right`` likewise or None, ``exposure_s``."""
 
     left: GrayImage
     right: GrayImage | None
@@ -70,6 +71,8 @@ class SprayedCapture:
         empty where the right camera took none.
     exposure_s
         Of both.
+    others
+        The same under a white pattern at other exposures: what saturates in one is measured in another.
     room
         The same with the projector off, where it was taken.
     depth_m
@@ -87,7 +90,8 @@ class SprayedCapture:
     left: tuple[GrayImage, ...]
     right: tuple[GrayImage, ...]
     exposure_s: float
-    room: RoomLight | None
+    others: tuple[ImagePair, ...]
+    room: ImagePair | None
     depth_m: FloatArray
     mask: BoolArray | None
     base_T_camera: FloatArray
@@ -103,7 +107,7 @@ class RecordedPlane:
     left: GrayImage
     exposure_s: float
     depth_m: FloatArray
-    room: RoomLight | None
+    room: ImagePair | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,14 +195,20 @@ class CalibrationCaptures:
         if any(True for name in ("white", "pattern_*") for _ in folder.glob(f"RIGHT_{name}.bmp")):
             right, right_files = self._lit(folder, "RIGHT")
             files += right_files
-        room, room_files = self._room(folder, "_off")
+        room, room_files = self._pair(folder, "off")
         files += room_files
+        others: list[ImagePair] = []
+        for image in sorted(folder.glob("LEFT_white_*.bmp"), key=_number_of):
+            pair, pair_files = self._pair(folder, image.stem.removeprefix("LEFT_"))
+            others += [pair] if pair is not None else []
+            files += pair_files
         mask_file, poses_file = folder / "mask_parts.png", folder / "GT_world2obj.json"
         files += [file for file in (mask_file, poses_file) if file.is_file()]
         return SprayedCapture(
             left=left,
             right=right,
             exposure_s=_exposure_s(about),
+            others=tuple(others),
             room=room,
             depth_m=depth_m,
             mask=read_gray(mask_file, self.dataset.rig.left) > 0 if mask_file.is_file() else None,
@@ -225,7 +235,7 @@ class CalibrationCaptures:
             name = image.stem.removeprefix("LEFT_white_")
             about, depth = image.with_suffix(".json"), folder / f"DEPTH_{name}.png"
             left = read_gray(image, self.dataset.rig.left)
-            room, room_files = self._room(folder, f"_off_{name}")
+            room, room_files = self._pair(folder, f"off_{name}")
             captures.append(RecordedPlane(name, left, _exposure_s(about), self.dataset.read_depth_m(depth), room))
             files += [image, about, depth, *room_files]
         return tuple(captures), tuple(files)
@@ -260,16 +270,16 @@ class CalibrationCaptures:
             raise DatasetError(f"{' and '.join(map(str, folders))}: no such folder of captures")
         return found
 
-    def _room(self, folder: Path, ending: str) -> tuple[RoomLight | None, list[Path]]:
-        """Return the images with the projector off, and their files; None and no files where there are none."""
+    def _pair(self, folder: Path, name: str) -> tuple[ImagePair | None, list[Path]]:
+        """Return the images of a name and their files; None and no files where there are none."""
         rig = self.dataset.rig
-        left, right = folder / f"LEFT{ending}.bmp", folder / f"RIGHT{ending}.bmp"
+        left, right = folder / f"LEFT_{name}.bmp", folder / f"RIGHT_{name}.bmp"
         if not left.is_file():
             return None, []
         about = left.with_suffix(".json")
         files = [left, about] + ([right] if right.is_file() else [])
         right_image = read_gray(right, rig.right) if right.is_file() else None
-        return RoomLight(read_gray(left, rig.left), right_image, _exposure_s(about)), files
+        return ImagePair(read_gray(left, rig.left), right_image, _exposure_s(about)), files
 
     def _lit(self, folder: Path, side: str) -> tuple[tuple[GrayImage, ...], list[Path]]:
         """Return the image under the white pattern, or in its place those under shifted dots, and their files."""

@@ -25,6 +25,7 @@ from sidelong.recipe import Recipe
 from sidelong.recorded.dataset import Dataset
 from sidelong.recorded.files import MM
 from sidelong.recorded.writing import pose_to_mm, write_gray, write_json, write_rig
+from sidelong.simulation.lighting import LightSettings
 from sidelong.simulation.lofting import loft, rectangle_ring
 from sidelong.simulation.rig import rig_for
 from sidelong.simulation.sensor import ActiveStereoSensor, SensorSettings
@@ -76,10 +77,11 @@ class BenchCamera:
 
     name = "bench camera"
 
-    def __init__(self, parts: Sequence[tuple[Part, FloatArray]], serial: str = SERIAL, width: int = 320) -> None:
-        self.serial = serial
-        self.rig = rig_for(width, width * 4 // 5)
-        self._sensor = ActiveStereoSensor(self.rig, parts, SensorSettings())
+    serial = SERIAL
+
+    def __init__(self, parts: Sequence[tuple[Part, FloatArray]], dome: float = LightSettings().dome) -> None:
+        self.rig = rig_for(320, 256)
+        self._sensor = ActiveStereoSensor(self.rig, parts, SensorSettings(light=LightSettings(dome=dome)))
 
     def open(self) -> None: ...
 
@@ -99,6 +101,7 @@ class Balls:
     """Three balls above a matte floor: their normals point everywhere. The materials share them half and half."""
 
     materials: tuple[str, ...]
+    dome: float = LightSettings().dome
 
     @property
     def part(self) -> Part:
@@ -115,11 +118,11 @@ class Balls:
     def camera(self, *, sprayed: bool = False) -> BenchCamera:
         part = self.part
         shown = replace(part, materials=("matte",) * len(part.materials)) if sprayed else part
-        return BenchCamera([(floor(), ABOVE_FLOOR), *((shown, pose) for pose in self.base_T_objects)])
+        return BenchCamera([(floor(), ABOVE_FLOOR), *((shown, pose) for pose in self.base_T_objects)], self.dome)
 
     def record(self, root: Path, name: str, exposure_s: float) -> None:
         """Take white images and sprayed depth, and write CAD model and poses, as ``name``."""
-        recorder(self.camera(), root, name).white(exposure_s)
+        recorder(self.camera(), root, name).white([exposure_s])
         recorder(self.camera(sprayed=True), root, name).sprayed(0.012)
         write_model(root, name, self.part)
         write_poses(root, name, self.base_T_objects)

@@ -227,3 +227,21 @@ def test_a_pose_that_is_none_is_named_with_its_image(root: Path) -> None:
     board(root, a=(2 * np.eye(4)).tolist())
     with pytest.raises(PoseError, match=r"poses\.json: a\.bmp: the"):
         captures(root).board()
+
+
+def test_other_exposures_of_the_white_image_come_in_their_order(root: Path) -> None:
+    for index, exposure_ms in ((2, 0.75), (10, 0.2), (1, 3.0)):
+        shutil.copy(phong(root) / "LEFT_white.bmp", phong(root) / f"LEFT_white_{index}.bmp")
+        (phong(root) / f"LEFT_white_{index}.json").write_text(json.dumps({"exposure_ms": exposure_ms}))
+    others = captures(root).sprayed().others
+    assert [other.exposure_s for other in others] == pytest.approx([3e-3, 0.75e-3, 0.2e-3])
+    assert captures(ROBI).sprayed().others == ()
+
+
+def test_the_room_is_read_where_it_was_taken(root: Path) -> None:
+    assert captures(root).sprayed().room is None
+    shutil.copy(phong(root) / "LEFT_white.bmp", phong(root) / "LEFT_off.bmp")
+    (phong(root) / "LEFT_off.json").write_text(json.dumps({"exposure_ms": 200}))
+    room = captures(root).sprayed().room
+    assert room is not None
+    assert (room.exposure_s, room.right) == (pytest.approx(0.2), None)

@@ -6,7 +6,7 @@ came by way of another surface cannot be told from one image: a robust fit takes
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -185,6 +185,26 @@ def reflectance_samples(
         materials=MappingProxyType(_by_material(found, scene.labels, dropped)),
         registration=registration,
         warnings=tuple(text for text, applies in warnings.items() if applies),
+    )
+
+
+def joined(captures: Sequence[CaptureSamples]) -> CaptureSamples:
+    """Join the samples of one scene at several exposures: what saturates in one is measured in another.
+
+    Pixels that were dropped, and how image and depth fit, are those of the first.
+    """
+    first = captures[0]
+    materials: dict[int, MaterialSamples] = {}
+    for label in {label: None for each in captures for label in each.materials}:
+        mine = [each.materials[label] for each in captures if label in each.materials]
+        materials[label] = MaterialSamples(
+            samples=stacked([each.samples for each in mine]),
+            pixels=np.concatenate([each.pixels for each in mine]),
+            right=np.concatenate([each.right for each in mine]),
+            dropped=mine[0].dropped,
+        )
+    return CaptureSamples(
+        materials, first.registration, tuple(dict.fromkeys(w for each in captures for w in each.warnings))
     )
 
 
