@@ -243,7 +243,7 @@ def main() -> None:
     ]
     show_speed(cases[0], 2 if options.quick else 5)
     counts = (200, 1000, 5000) if options.quick else (50, 100, 200, 500, 1000, 2000, 3000, 5000, 10_000)
-    show_sweep(cases, counts, (DEFAULT_GRID,) if options.quick else (DEFAULT_GRID, 400))
+    show_sweep(cases, counts, (DEFAULT_GRID, 1000) if options.quick else (DEFAULT_GRID, 400, 1000))
     show_ends(cases)
 
 

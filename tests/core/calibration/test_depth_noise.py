@@ -57,6 +57,6 @@ def test_noise_takes_a_larger_window_and_its_errors_are_as_stated() -> None:
 
 
 def test_a_small_part_without_noise_takes_a_small_window() -> None:
-    depth_m, _ = noisy_sphere(2e-6, 0.0, radius_m=0.012)
+    depth_m, _ = noisy_sphere(2e-6, 0.0, radius_m=0.008)
     _, settings = informative_normals(depth_m, CAMERA, np.isfinite(depth_m))
     assert settings.window_px == 5
