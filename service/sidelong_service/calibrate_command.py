@@ -54,7 +54,9 @@ def response(
 @calibrate.command()
 def projector(
     dataset: DataSet,
-    plane_k_d: Annotated[float, typer.Option(help="Diffuse share of the plane, 0..1.")],
+    plane_k_d: Annotated[
+        float, typer.Option(help="Diffuse share of the plane, 0..1; only its product with the intensity counts.")
+    ],
     object_name: Object = None,
     calibration: Calibrations = None,
     output: Output = HERE,

@@ -181,6 +181,7 @@ def _exposures_s(text: str) -> list[float]:
             exposures.append(float(each) * 1e-3)
         except ValueError as error:
             raise CommandError(f"--exposures-ms: {each!r:.40} is no number") from error
+    exposures = list(dict.fromkeys(exposures))
     if not exposures:
         raise CommandError(f"--exposures-ms: {text!r:.40} names none, needs at least one")
     return exposures

@@ -89,10 +89,15 @@ class Storage:
         self._now = now
         self._db = sqlite3.connect(file, isolation_level=None)
         self._db.row_factory = sqlite3.Row
-        self._db.execute("PRAGMA journal_mode = WAL")
-        self._db.execute("PRAGMA synchronous = FULL")
-        self._db.execute("PRAGMA foreign_keys = ON")
-        self._migrate()
+        try:
+            self._db.execute("PRAGMA journal_mode = WAL")
+            self._db.execute("PRAGMA synchronous = FULL")
+            self._db.execute("PRAGMA foreign_keys = ON")
+            self._migrate()
+        except BaseException:
+            # a migration that failed holds a lock as long as the connection lives
+            self._db.close()
+            raise
 
     def check(self) -> None:
         """Look through all pages. Raises sqlite3.DatabaseError where they are damaged."""
@@ -157,7 +162,9 @@ class Storage:
         query = f"SELECT id FROM runs WHERE state IN ({','.join('?' * len(_OPEN_STATES))})"
         left = [str(row["id"]) for row in self._db.execute(query, _OPEN_STATES)]
         for run_id in left:
-            trouble = problem("service-restarted", "The service ended while this was active.", scan_id=run_id)
+            row = self._row(run_id)
+            owner = "scan_id" if row is not None and row["kind"] == RunKind.SCAN else "job_id"
+            trouble = problem("service-restarted", "The service ended while this was active.", **{owner: run_id})
             self.set_state(run_id, RunState.INTERRUPTED, trouble=trouble)
         return len(left)
 

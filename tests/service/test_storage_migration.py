@@ -235,7 +235,6 @@ def test_runs_that_a_former_service_left_open_are_interrupted(storage: Storage) 
     assert storage.interrupt_open_runs() == 0
 
 
-@pytest.mark.xfail(strict=True, reason="Storage.interrupt_open_runs names a job as scan_id")
 def test_an_interrupted_job_is_named_as_a_job(storage: Storage) -> None:
     storage.create("open", JOB)
     storage.interrupt_open_runs()

@@ -32,8 +32,13 @@ def write_rig(root: Path, rig: StereoRig, serial: str) -> None:
     folder = root / "cam"
     if folder.is_dir():
         recorded = Dataset(root)
-        if recorded.serial != serial or recorded.rig.left != rig.left:
+        if recorded.serial != serial:
             raise DatasetError(f"{root}: holds recordings of camera {recorded.serial}, this one is {serial}")
+        if recorded.rig.left != rig.left:
+            raise DatasetError(
+                f"{root}: holds recordings of {recorded.rig.left.width}x{recorded.rig.left.height} px with other "
+                f"intrinsics than this camera, {serial}, {rig.left.width}x{rig.left.height} px, has now"
+            )
         return
     folder.mkdir(parents=True)
     baseline_mm = rig.baseline_m / MM

@@ -32,7 +32,7 @@ def test_recordings_of_two_cameras_are_kept_apart(tmp_path: Path) -> None:
     write_rig(tmp_path, rig_for(640, 512), "N35-1")
     with pytest.raises(DatasetError, match="holds recordings of camera N35-1, this one is N35-2"):
         write_rig(tmp_path, rig_for(640, 512), "N35-2")
-    with pytest.raises(DatasetError, match="holds recordings"):
+    with pytest.raises(DatasetError, match="holds recordings of 640x512 px with other intrinsics"):
         write_rig(tmp_path, rig_for(320, 256), "N35-1")
 
 
