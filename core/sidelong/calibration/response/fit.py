@@ -40,6 +40,8 @@ OUTLIER_LIMIT = 0.03
 """Largest share of residuals beyond ``OUTLIER_SPREADS``: hot pixels pass, a part of the scene that moved does not."""
 SUSPECT_RATIO = 1.5
 """An image, or the tails of all residuals, this much above the typical spread makes the fit look for a moved image."""
+LEAST_DOUBT_GREY = 2.0
+"""Residuals below this are noise, however unevenly images share them: dark images have less of it than bright ones."""
 SUSPECT_GREY = 4.0
 """Residuals beyond this are warned of."""
 CULPRIT_DROP = 0.75
@@ -224,7 +226,7 @@ def _agreeing_fit(samples: Samples, bracket: Bracket) -> tuple[CurveFit, list[st
     uneven = max(float(np.nanmax(per_image) / np.nanmedian(per_image)), total / typical)
     outliers = fit.outlier_share(OUTLIER_SPREADS)
     bad = typical > RESIDUAL_LIMIT_GREY or outliers > OUTLIER_LIMIT
-    if bad or uneven > SUSPECT_RATIO:
+    if bad or (uneven > SUSPECT_RATIO and total > LEAST_DOUBT_GREY):
         _name_culprit(samples, bracket, total)
     if bad:
         raise CalibrationError(
