@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sidelong.commissioning.procedures import Captures, perform
-
 from sidelong.recorded.dataset import Dataset
 from sidelong_service.calibration_store import CalibrationStore
 from sidelong_service.messages import CapturesJob, Settings
