@@ -110,7 +110,7 @@ def draw(report: ReliabilityReport, title: str) -> bytes:
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     draw_on(above, below, report)
     sums = f"predicted {report.predicted_px:.0f} px, measured {report.measured_px:.0f} px"
-    figure.suptitle(f"{title}\n{sums}, {told(report)}", fontsize="medium")
+    figure.suptitle(f"{title}\n{sums}\n{told(report)}", fontsize="medium")
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
     return picture.getvalue()

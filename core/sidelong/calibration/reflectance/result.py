@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -27,6 +27,8 @@ CHI_SQUARED_95 = 7.815
 LARGEST_CONDITION = 1e16
 LARGE_TILT_DEG, LARGE_MISFIT, MANY_OUTLIERS, NEAR_MIRROR_DEG, MUCH_SATURATED = 0.5, 0.1, 0.05, 20.0, 0.3
 """What deserves a warning."""
+NO_PEAK = 0.9
+"""Share of saturated samples near the mirror direction above which the peak of the highlight was not measured."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Parameter:
     Attributes
     ----------
     value
-        The estimate, or a stand-in where ``stand_in`` says so.
+        The estimate; where it is not identified a stand-in, or what ``note`` says.
     standard_error
         Of the estimate; 0 where it is a stand-in.
     low, high
@@ -220,7 +222,7 @@ def report(
     alpha = fitted.alpha_rad
     return ReflectanceFit(
         phong=Phong(parameters["k_d"].value, parameters["k_s"].value, parameters["n"].value),
-        parameters=parameters,
+        parameters=_without_peak(parameters, found),
         absorbing=judged.absorbing,
         tilt_rad=at[TILT],
         tilt_standard_error_rad=np.sqrt(np.diag(found.covariance)[TILT]) * problem.free[TILT],
@@ -241,6 +243,28 @@ def report(
         iterations=found.point.iterations,
         warnings=_warnings(found, judged),
     )
+
+
+def _clipped_peak(fitted: ReflectanceSamples) -> float:
+    """Return the share of the samples near the mirror direction that are saturated."""
+    near = fitted.alpha_rad < np.deg2rad(NEAR_MIRROR_DEG)
+    return float(fitted.saturated[near].mean()) if near.any() else 0.0
+
+
+def _without_peak(parameters: Mapping[str, Parameter], found: Found) -> Mapping[str, Parameter]:
+    """Take back that n and k_s are identified where no peak was measured and the surface is no Phong surface.
+
+    On a Phong surface the flanks of a lobe tell its peak; on another they tell of the flanks alone.
+    """
+    if _clipped_peak(found.problem.samples) <= NO_PEAK or found.misfit <= LARGE_MISFIT:
+        return parameters
+    note = "extrapolated from the flanks of a saturated highlight of no Phong surface: expose less to measure it"
+    doubted = {
+        name: replace(parameters[name], identified=False, note=note)
+        for name in ("n", "k_s")
+        if parameters[name].identified
+    }
+    return MappingProxyType({**parameters, **doubted})
 
 
 def _robust_rms(error: FloatArray) -> float:
@@ -274,8 +298,7 @@ def _warnings(found: Found, judged: Judged) -> tuple[str, ...]:
     tilt_deg = float(np.rad2deg(np.linalg.norm(np.where(certain, tilt, 0.0))))
     outliers = float((np.abs(judged.point.residual) > problem.limit).mean())
     nearest_deg = float(np.rad2deg(fitted.alpha_rad.min()))
-    near = fitted.alpha_rad < np.deg2rad(NEAR_MIRROR_DEG)
-    clipped = float(fitted.saturated[near].mean()) if near.any() else 0.0
+    clipped = _clipped_peak(fitted)
     said = {
         f"the search ended after {found.point.iterations} steps without converging": not found.point.converged,
         f"all normals seem tilted by {tilt_deg:.1f} deg: check the calibration of cameras and projector": (

@@ -478,3 +478,13 @@ def test_noise_that_hides_the_curve_is_refused_by_its_standard_error() -> None:
     times_s = np.array([0.0025, 0.01, 0.04])
     with pytest.raises(CalibrationError, match=r"standard error of g is 0\.\d+ ln units|residuals|contradict"):
         fit_response(capture(scene(), times_s, gamma(0.3), 6.0), times_s)
+
+
+def test_noise_that_one_image_has_more_of_is_no_sign_that_it_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = capture(scene(), SEVEN_S, knee, 0.5)
+    loud = images[4] + np.random.default_rng(5).normal(0.0, 1.6, images[4].shape)
+    images[4] = np.where((images[4] > 0) & (images[4] < 255), np.clip(np.rint(loud), 0, 255), images[4])
+    assert fit_response(images, SEVEN_S).noise_grey < 2.0
+    monkeypatch.setattr("sidelong.calibration.response.fit.LEAST_DOUBT_GREY", 0.0)
+    with pytest.raises(CalibrationError, match="disagrees with the other images"):
+        fit_response(images, SEVEN_S)
