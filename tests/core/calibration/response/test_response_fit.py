@@ -238,8 +238,7 @@ def test_any_power_law_comes_back_and_rises(exponent: float, noise_grey: float, 
 # --- the linear algebra
 
 
-@settings(max_examples=10, deadline=20_000)
-@given(seed=st.integers(0, 10_000), exponent=st.floats(1, 6))
+@pytest.mark.parametrize(("seed", "exponent"), [(0, 1.0), (1, 2.0), (2, 3.0), (3, 4.5), (4, 6.0)])
 def test_elimination_equals_the_full_system(seed: int, exponent: float) -> None:
     """Debevec and Malik's system with 255 levels and all log radiances, by numpy's dense least squares."""
     random, smoothness, pixels = np.random.default_rng(seed), 10.0**exponent, 150
