@@ -20,6 +20,7 @@ from sse_starlette import EventSourceResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from sidelong.errors import SidelongError
 from sidelong_service.answers import ArtifactFile, LocalHosts, answer
 from sidelong_service.calibration_routes import add_calibration_routes
 from sidelong_service.calibration_store import CalibrationStore
@@ -214,6 +215,10 @@ def _add_problem_handlers(app: FastAPI) -> None:
     @app.exception_handler(ServiceError)
     async def on_service_error(_request: Request, error: ServiceError) -> Response:
         return answer(error.problem)
+
+    @app.exception_handler(SidelongError)
+    async def on_planner_error(_request: Request, error: SidelongError) -> Response:
+        return answer(problem_of(error))
 
     @app.exception_handler(RequestValidationError)
     async def on_validation_error(_request: Request, error: RequestValidationError) -> Response:

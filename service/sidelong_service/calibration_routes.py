@@ -10,11 +10,10 @@ from fastapi.responses import FileResponse
 from sse_starlette import EventSourceResponse
 
 from sidelong.commissioning.documents import to_json
-from sidelong.errors import SidelongError
 from sidelong_service.answers import ArtifactFile
 from sidelong_service.events import PING_S, follow, sse
 from sidelong_service.models import CalibrationJob, CalibrationList, CalibrationRequest, JobList, Limit
-from sidelong_service.problems import ServiceError, problem, problem_of
+from sidelong_service.problems import ServiceError, problem
 from sidelong_service.routing import EVENTS, Cursor, LastEvent, TheService, body_of, described_body, documented
 from sidelong_service.storage import Storage
 
@@ -102,10 +101,7 @@ def _add_file_routes(app: FastAPI) -> None:
     )
     async def read_calibration(calibration_id: str, service: TheService) -> Response:
         """Read a calibration file."""
-        try:
-            document = await asyncio.to_thread(service.calibrations.read, calibration_id)
-        except SidelongError as error:
-            raise ServiceError(problem_of(error)) from error
+        document = await asyncio.to_thread(service.calibrations.read, calibration_id)
         return Response(to_json(document), media_type="application/json")
 
     @app.get(
@@ -115,8 +111,5 @@ def _add_file_routes(app: FastAPI) -> None:
     )
     async def read_picture(calibration_id: str, service: TheService) -> FileResponse:
         """Read the picture of a calibration."""
-        try:
-            path = await asyncio.to_thread(service.calibrations.picture, calibration_id)
-        except SidelongError as error:
-            raise ServiceError(problem_of(error)) from error
+        path = await asyncio.to_thread(service.calibrations.picture, calibration_id)
         return ArtifactFile(path, media_type="image/png", headers={"X-Content-Type-Options": "nosniff"})

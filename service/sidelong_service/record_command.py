@@ -152,7 +152,10 @@ def print_board(
         write_whole(folder / "board.json", board.model_dump_json(indent=1).encode())
         for name in ("board.png", "board.json"):
             out.print(f"  {folder / name}", highlight=False, markup=False, soft_wrap=True)
-        out.print("print at 100 %, then measure a row of squares: 0.1 % off is 0.7 mm at the camera", highlight=False)
+        out.print(
+            "print at 100 %, then measure it: an error of scale moves the camera by that share",
+            highlight=False,
+        )
 
 
 def _record(

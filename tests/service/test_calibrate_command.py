@@ -296,3 +296,15 @@ def wait_for_rays(pid: int) -> None:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_a_board_is_printed_with_the_description_that_calibrating_reads(tmp_path: Path) -> None:
+    succeeded_here(
+        tmp_path, "record", "print-board", "board", "--squares", "7x5", "--square-mm", "30", "--marker-mm", "22"
+    )
+    about = json.loads((tmp_path / "board/board.json").read_text())
+    assert (about["squares_x"], about["squares_y"]) == (7, 5)
+    assert (about["square_m"], about["marker_m"]) == pytest.approx((0.03, 0.022))
+    assert (tmp_path / "board/board.png").read_bytes().startswith(b"\x89PNG")
+    assert "is not like 11x8" in refused_here(tmp_path, "record", "print-board", "board", "--squares", "7")
+    assert "marker_m" in refused_here(tmp_path, "record", "print-board", "board", "--marker-mm", "25")

@@ -20,7 +20,6 @@ from sidelong.physics.sensing import SensingCurve
 
 FORMAT_VERSION = 1
 ID_LENGTH = 12
-PREFIX_BYTES = 1 << 20
 
 Pose = Annotated[tuple[FiniteFloat, ...], Field(min_length=16, max_length=16)]
 Triple = Annotated[tuple[FiniteFloat, ...], Field(min_length=3, max_length=3)]
