@@ -21,10 +21,14 @@ from numpy.typing import ArrayLike
 from sidelong.geometry.transforms import invert, validated_transform
 from sidelong.types import FloatArray
 
-FORWARD_TOLERANCE = 1e-9
+FORWARD_TOLERANCE = 1e-7
 """Largest difference of an entry (metres, or of a rotation) between a target and the pose its solution leads to."""
-WRIST_SINGULAR_SINE = 1e-9
-"""Below this sine of joint 5 the target says nothing about joint 6."""
+WRIST_SINGULAR_SINE = 5e-9
+"""Below this sine of joint 5 the target says nothing about joint 6.
+
+At this sine rounding costs joint 6 some 1e-7 rad, and leaving the sine out costs the pose twice the sine: both stay
+within ``FORWARD_TOLERANCE`` even where the elbow is stretched and cannot make up for it.
+"""
 
 _TWIST_RAD = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 _BRANCHES = np.array(list(itertools.product((1.0, -1.0), repeat=3))).T  # signs of shoulder, wrist, elbow: (3, 8)
