@@ -79,18 +79,45 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One pose an object may have: ``camera_T_object`` (4, 4), the matcher's score 0..100, the probability 0..1."""
+    """One pose an object may have.
+
+    Attributes
+    ----------
+    camera_T_object
+        (4, 4) in the left camera of the reference view.
+    score
+        The detector's, 0..100.
+    probability
+        0..1, given the object.
+    covariance
+        (6, 6) of a small turn (rad, about the part's centre) followed by a small shift (m), both along the axes of that
+        camera; None where nothing was measured that could tell. Directions that no depth determines keep the variance
+        of detection.
+    """
 
     camera_T_object: FloatArray
     score: float
     probability: float
+    covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class DetectedObject:
-    """An object of the reference image and its pose hypotheses, most probable first; probabilities sum to 1."""
+    """An object of the reference image.
+
+    Attributes
+    ----------
+    hypotheses
+        Poses it may have, most probable first; probabilities sum to 1.
+    visible_fraction
+        Share 0..1 of the silhouette of its most probable pose that no other object hides in the reference view.
+    supporting_views
+        Names of the views whose depth refined it, in the order they were taken; none before refinement.
+    """
 
     hypotheses: tuple[Hypothesis, ...]
+    visible_fraction: float = 1.0
+    supporting_views: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
