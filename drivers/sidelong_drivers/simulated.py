@@ -15,6 +15,7 @@ from sidelong.geometry.camera_model import StereoRig
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.transforms import transform, validated_transform
 from sidelong.simulation.bin import Bin, fill_bin
+from sidelong.simulation.heap import heap
 from sidelong.simulation.parts import simulated_part
 from sidelong.simulation.rig import BASELINE_M, rig_for
 from sidelong.simulation.sensor import ActiveStereoSensor, SensorSettings
@@ -34,6 +35,7 @@ class SimulatedCameraSettings(BaseModel):
     part: str = Field(default="tube_fitting", description="name of a simulated part")
     count: int = Field(default=10, ge=0, le=200, description="how many lie in the bin")
     seed: int = Field(default=0, ge=0, description="how they lie")
+    heap: bool = Field(default=False, description="whether they lie on each other instead of side by side")
     sprayed: bool = Field(default=False, description="whether the parts are covered with anti-reflective spray")
     width: int = Field(default=640, ge=80, le=2560, description="image width in pixels")
     height: int = Field(default=512, ge=64, le=2048, description="image height in pixels, 4/5 of the width")
@@ -108,7 +110,8 @@ class SimulatedCamera:
         settings = self.settings
         rig = rig_for(settings.width, settings.height)
         part = simulated_part(settings.part)
-        base_T_objects = fill_bin(part, settings.count, settings.seed, self.base_T_bin, settings.bin)
+        fill = heap if settings.heap else fill_bin
+        base_T_objects = fill(part, settings.count, settings.seed, self.base_T_bin, settings.bin)
         # spray makes every surface matte
         shown = replace(part, materials=("matte",) * len(part.materials)) if settings.sprayed else part
         scene = [(settings.bin.part(), self.base_T_bin), *((shown, pose) for pose in base_T_objects)]

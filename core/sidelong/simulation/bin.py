@@ -27,9 +27,10 @@ class Bin(BaseModel):
     height_m: FiniteFloat = Field(default=0.04, gt=0.0, le=1.0, description="height of the walls above the floor")
     wall_m: FiniteFloat = Field(default=0.004, ge=0.0005, le=0.1, description="thickness of walls and floor")
     table_m: FiniteFloat = Field(default=1.4, gt=0.05, le=4.0, description="side of the square table the bin stands on")
+    material: str = Field(default="matte", description="of bin and table: matte, or printed for a strong texture")
 
     def part(self) -> Part:
-        """Return box and table as one matte part (two closed shells that share a plane nobody sees)."""
+        """Return box and table as one part (two closed shells that share a plane nobody sees)."""
         outer = (self.length_m + 2 * self.wall_m, self.width_m + 2 * self.wall_m)
         inner = (self.length_m, self.width_m)
         box = [
@@ -39,7 +40,7 @@ class Bin(BaseModel):
             rectangle_ring(*inner, 0.0),
         ]
         table = [rectangle_ring(self.table_m, self.table_m, z) for z in (-self.wall_m - 0.02, -self.wall_m)]
-        return part_from_arrays("bin", *joined([loft(box), loft(table)]), materials=("matte",))
+        return part_from_arrays("bin", *joined([loft(box), loft(table)]), materials=(self.material,))
 
 
 def fill_bin(part: Part, count: int, seed: int, base_T_bin: FloatArray, bin_: Bin) -> list[FloatArray]:

@@ -16,7 +16,7 @@ from sidelong.geometry.camera_model import LightProjector, PinholeCamera
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.raycast import SURFACE_OFFSET_M, RayScene
 from sidelong.geometry.transforms import invert, rotate, transform_points
-from sidelong.simulation.materials import Surface, dot, fresnel, reflectance, surface_table, unit
+from sidelong.simulation.materials import Surface, dot, fresnel, printed, reflectance, surface_table, unit
 from sidelong.types import FloatArray, IntArray
 
 LAMP_DISTANCE_M = 3.0
@@ -98,6 +98,7 @@ class World:
     def __init__(self, parts: Sequence[tuple[Part, FloatArray]]) -> None:
         self.rays = RayScene(parts)
         self._surfaces = [surface_table(part.materials) for part, _ in parts]
+        self._names = [part.materials for part, _ in parts]
         self._materials = [part.triangle_material for part, _ in parts]
 
     def hit(self, origins: FloatArray, directions: FloatArray) -> tuple[IntArray, Points]:
@@ -111,7 +112,8 @@ class World:
         for index, (surface, material) in enumerate(zip(self._surfaces, self._materials, strict=True)):
             mine = np.flatnonzero(instance == index)
             which = material[triangle[mine]]
-            table[:, mine] = surface.diffuse[which], surface.f0[which], surface.alpha[which]
+            diffuse = surface.diffuse[which] * printed(self._names[index], which, position[mine])
+            table[:, mine] = diffuse, surface.f0[which], surface.alpha[which]
         return chosen, Points(position, hits.normals[chosen], Surface(table[0], table[1], table[2]))
 
 

@@ -86,6 +86,6 @@ def test_unit_gives_length_one():
 
 def test_an_unknown_material_is_refused_with_the_known_names():
     with pytest.raises(
-        UnknownNameError, match=r"'glass' is unknown, known are stainless, plated, matte, black_plastic"
+        UnknownNameError, match=r"'glass' is unknown, known are stainless, plated, matte, black_plastic, printed"
     ):
         surface_table(["matte", "glass"])

@@ -1,0 +1,184 @@
+"""Detection on rendered heaps of shiny parts: what is found, how well, and in what time.
+
+    python tests/benchmarks/bench_detection.py [--parts tube_fitting,gear,part.stl] [--grounds matte,printed]
+                                               [--seeds 0,1,2] [--set match_threshold=75 ...] [--no-depth] [--store DIR]
+
+Each scene is a heap of one part in a bin, seen from a view of the dome at 1280x1024 by the simulated camera: ground and
+bin plain (matte) or strongly textured (printed). Counted are the parts of which at least 60 % is unoccluded:
+
+found      an object's best hypothesis is centred within a quarter of the diameter, as the camera sees it
+best 10    of those counted, one of the first ten hypotheses of an object so placed is within 15 degrees
+top 1      the most probable one is; both modulo the part's symmetry
+correct    ADI of the most probable one is below 10 % of the diameter
+false      objects per scene that lie on no part at all, however hidden
+match, s   seconds in the matcher, and beside it those of the rest of the detection; median over scenes
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from sidelong.detection.line2d import Line2DDetector
+from sidelong.detection.settings import DetectionSettings
+from sidelong.geometry.mesh import Part, load_part
+from sidelong.geometry.raycast import RayScene
+from sidelong.geometry.transforms import invert, transform, transform_points
+from sidelong.planning.candidates import DomeSettings, dome_views
+from sidelong.simulation.bin import Bin
+from sidelong.simulation.heap import heap
+from sidelong.simulation.parts import simulated_part
+from sidelong.simulation.rig import rig_for
+from sidelong.simulation.sensor import ActiveStereoSensor, SensorSettings
+from sidelong.types import DetectedObject, Projector
+
+SIZE_PX = (1280, 1024)
+BIN = Bin(length_m=0.20, width_m=0.16)
+BASE_T_BIN = transform(np.eye(3), (0.5, 0.0, 0.0))
+PARTS_PER_BIN = 16
+VISIBLE = 0.6
+NEAR = 0.25
+ANGLE_RAD = np.radians(15.0)
+CORRECT = 0.1
+IMAGE_EXPOSURE_S, DEPTH_EXPOSURE_S = 0.2, 0.012
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a camera saw of a heap, and the truth: poses (N, 4, 4) in that camera and how much of each is visible."""
+
+    image: np.ndarray
+    depth_m: np.ndarray
+    camera_T_objects: np.ndarray
+    visible: np.ndarray
+
+
+def photographed(part: Part, ground: str, seed: int, store: Path | None) -> Case:
+    """Render a case, or read it from the store."""
+    path = None if store is None else store / f"{part.name}_{ground}_{seed}.npz"
+    if path is not None and path.is_file():
+        with np.load(path) as kept:
+            return Case(kept["image"], kept["depth_m"], kept["poses"], kept["visible"])
+    rig, views = rig_for(*SIZE_PX), dome_views((0.5, 0.0, 0.03), DomeSettings())
+    base_T_camera = views[seed % len(views)].base_T_camera
+    box = BIN.model_copy(update={"material": ground})
+    base_T_objects = heap(part, PARTS_PER_BIN, seed, BASE_T_BIN, box)
+    scene = [(box.part(), BASE_T_BIN), *((part, pose) for pose in base_T_objects)]
+    sensor = ActiveStereoSensor(rig, scene, SensorSettings())
+    image = sensor.capture(base_T_camera, Projector.OFF, IMAGE_EXPOSURE_S, depth=False).left
+    depth_m = sensor.capture(base_T_camera, Projector.DOTS, DEPTH_EXPOSURE_S, depth=True).depth_m
+    assert depth_m is not None
+    seen = RayScene(scene).render(rig.left, base_T_camera).instance
+    alone = [RayScene([(part, pose)]).render(rig.left, base_T_camera).instance >= 0 for pose in base_T_objects]
+    visible = np.array([np.mean(seen[mask] == k + 1) if mask.any() else 0.0 for k, mask in enumerate(alone)])
+    poses = invert(base_T_camera) @ np.array(base_T_objects)
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(path, image=image, depth_m=depth_m, poses=poses, visible=visible)
+    return Case(image, depth_m, poses, visible)
+
+
+@dataclass
+class Tally:
+    """Counts over the scenes of one part on one ground."""
+
+    counted: int = 0
+    found: int = 0
+    best: int = 0
+    top: int = 0
+    correct: int = 0
+    false: int = 0
+    scenes: int = 0
+
+    def add(self, part: Part, case: Case, objects: tuple[DetectedObject, ...]) -> None:
+        """Count one scene."""
+        self.scenes += 1
+        top = np.array([each.hypotheses[0].camera_T_object for each in objects]).reshape(-1, 4, 4)
+        here = top[:, :3, :3] @ part.centre_m + top[:, :3, 3]
+        there = case.camera_T_objects[:, :3, :3] @ part.centre_m + case.camera_T_objects[:, :3, 3]
+        # sideways only: the distance is what a single image knows least
+        apart = np.linalg.norm(here[None, :, :2] / here[None, :, 2:] - there[:, None, :2] / there[:, None, 2:], axis=-1)
+        near = apart * there[:, None, 2] < NEAR * part.diameter_m
+        self.false += int((~near.any(axis=0)).sum())
+        points = part.vertices_m[:: max(1, len(part.vertices_m) // 1500)]
+        for truth, pose in enumerate(case.camera_T_objects):
+            if case.visible[truth] < VISIBLE:
+                continue
+            self.counted += 1
+            mine = np.flatnonzero(near[truth])
+            mine = mine[np.argsort(apart[truth, mine])]
+            turns = [
+                [part.symmetry.angle_rad(h.camera_T_object[:3, :3], pose[:3, :3]) for h in objects[k].hypotheses[:10]]
+                for k in mine
+            ]
+            self.found += len(mine) > 0
+            self.best += any(min(turn) < ANGLE_RAD for turn in turns)
+            self.top += any(turn[0] < ANGLE_RAD for turn in turns)
+            wanted = KDTree(transform_points(pose, points))
+            errors_m = [float(np.mean(wanted.query(transform_points(top[k], points))[0])) for k in mine]
+            self.correct += min(errors_m, default=np.inf) < CORRECT * part.diameter_m
+
+
+def row(part: Part, ground: str, tally: Tally, times_s: list[tuple[float, float]]) -> str:
+    """Return a line of the table."""
+    counted = max(tally.counted, 1)
+    shares = [100 * each / counted for each in (tally.found, tally.best, tally.top, tally.correct)]
+    match_s, rest_s = np.median(times_s, axis=0)
+    figures = " ".join(f"{share:7.1f}" for share in shares)
+    return (
+        f"{part.name:14s} {ground:8s} {tally.counted:7d} {figures} {tally.false / tally.scenes:6.1f} "
+        f"{match_s:9.2f} {rest_s:6.2f}"
+    )
+
+
+def measured(
+    part: Part, ground: str, seeds: list[int], settings: DetectionSettings, options: argparse.Namespace
+) -> Iterator[str]:
+    """Detect in each scene and yield the line of the table."""
+    tally, times_s = Tally(), list[tuple[float, float]]()
+    cases = [photographed(part, ground, seed, options.store) for seed in seeds]
+    deep = np.concatenate([case.camera_T_objects[:, 2, 3] for case in cases])
+    reaching = settings.reaching(float(deep.min()) * 0.97, float(deep.max()) * 1.03)
+    with Line2DDetector(part, rig_for(*SIZE_PX).left, reaching, options.cache) as detector:
+        detector.prepare()
+        for case in cases:
+            objects = detector.detect(case.image, None if options.no_depth else case.depth_m)
+            report = detector.last_report
+            assert report is not None
+            times_s.append((report.match_s, report.align_s))
+            tally.add(part, case, objects)
+    yield row(part, ground, tally, times_s)
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", default="tube_fitting,hex_screw,eye_bolt,gear", help="simulated parts or CAD files")
+    parser.add_argument("--grounds", default="matte,printed")
+    parser.add_argument("--seeds", default="0,1,2")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the detection")
+    parser.add_argument("--no-depth", action="store_true", help="detect in the image alone")
+    parser.add_argument("--store", type=Path, default=None, help="keep rendered scenes here")
+    parser.add_argument("--cache", type=Path, default=Path("templates"), help="trained templates")
+    options = parser.parse_args()
+    changed = {name: json.loads(value) for name, value in (each.split("=", 1) for each in options.set)}
+    settings = DetectionSettings.model_validate(changed)
+    sys.stdout.write(f"{'part':14s} {'ground':8s} counted   found best 10   top 1 correct  false  match, s rest, s\n")
+    for name in options.parts.split(","):
+        part = load_part(Path(name)) if Path(name).suffix else simulated_part(name)
+        for ground in options.grounds.split(","):
+            for line in measured(part, ground, [int(seed) for seed in options.seeds.split(",")], settings, options):
+                sys.stdout.write(line + "\n")
+                sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
