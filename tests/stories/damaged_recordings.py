@@ -94,7 +94,7 @@ def write_mesh_in_metres(root: Path) -> None:
 
 def open_mesh(root: Path) -> None:
     header, triangles = read_stl(root / CAD_MODEL)
-    triangles["corners"][0, 0] += 1.0
+    triangles["corners"][::10, 0] += 1.0
     rewrite(root / CAD_MODEL, header + triangles.tobytes())
 
 

@@ -114,6 +114,17 @@ class RayScene:
         rays = self._tensor(np.concatenate([origins, targets - origins], axis=-1))
         return self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0).numpy()
 
+    def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the nearest points of all surfaces to points (..., 3), and the outward unit normals there, (..., 3).
+
+        On an edge the normal is that of one of its triangles. In an empty scene both are NaN.
+        """
+        if not len(self._normals) or points.size == 0:
+            return np.full(points.shape, np.nan), np.full(points.shape, np.nan)
+        answer = self._scene.compute_closest_points(self._tensor(points))
+        triangle = answer["primitive_ids"].numpy() + self._first_triangle[answer["geometry_ids"].numpy()]
+        return answer["points"].numpy().astype(np.float64), self._normals[triangle]
+
     def render(self, camera: PinholeCamera, scene_T_camera: FloatArray) -> Rendering:
         """Render depth, part, triangle and normal for each pixel centre of ``camera`` at ``scene_T_camera``."""
         hits = self.cast(scene_T_camera[:3, 3], rotate(scene_T_camera, camera.pixel_rays()))

@@ -91,7 +91,11 @@ def with_nan() -> FloatArray:
         (np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp), r"box: the mesh is empty \(0 vertices, 0 triangles\)"),
         (box()[0], np.zeros((0, 3), dtype=np.intp), r"box: the mesh is empty \(8 vertices, 0 triangles\)"),
         (with_nan(), box()[1], "box: 2 vertex coordinates are not finite"),
-        (box()[0], box()[1][:-1], "box: the mesh is not watertight, 3 edges have not exactly two triangles, limit 0"),
+        (
+            box()[0],
+            box()[1][:-1],
+            "box: the mesh is not watertight, 3 edges have a triangle on one side alone; .* 14.3 %",
+        ),
         (box()[0][:-1], box()[1], "box: triangles refer to vertices 0 to 7, the mesh has 7"),
         (box()[0], box()[1] - 1, "box: triangles refer to vertices -1 to 6, the mesh has 8"),
         (box()[0] * 1e-3, box()[1], r"box: the largest extent is 0\.12 mm, limits 0\.5 to 5000 mm; .* in metres"),
