@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
+from sidelong.detection.refinement_settings import RefinementSettings
 from sidelong.detection.settings import DetectionSettings
 from sidelong.fusion.settings import FusionSettings
 from sidelong.physics.sensing import SensingSettings
@@ -18,6 +20,7 @@ from sidelong.planning.selection import Strategy, StrategyName, strategy_of
 from sidelong.types import DetectedObject, FloatArray, GrayImage
 
 if TYPE_CHECKING:  # the service reads recipes without open3d
+    from sidelong.detection.refinement import DepthView
     from sidelong.geometry.camera_model import StereoRig
     from sidelong.geometry.mesh import Part
     from sidelong.planning.gain import LightModel
@@ -47,6 +50,10 @@ class Recipe(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     detection: DetectionSettings = DetectionSettings()
+    refinement: RefinementSettings | None = Field(
+        default=RefinementSettings(),
+        description="of poses, by the depth of every view; null: as detected, as in the paper",
+    )
     planning: PlanningSettings = PlanningSettings()
     light: LightSettings = LightSettings()
     sensing: SensingSettings = SensingSettings()
@@ -85,6 +92,29 @@ class GivenObjects:
         """Nothing is held."""
 
 
+class PoseRefiner(Protocol):
+    """Brings the poses of one scan into line with the depth of every view."""
+
+    def add(self, view: DepthView) -> None:
+        """Take in the depth of one more view; the reference view comes first."""
+        ...
+
+    def refine(self, objects: tuple[DetectedObject, ...]) -> tuple[DetectedObject, ...]:
+        """Return the objects as all views show them; the same tuple where nothing is to be changed."""
+        ...
+
+
+class AsDetected:
+    """Stands in for a refiner where poses are to stay as they are: refinement is left out."""
+
+    def add(self, view: DepthView) -> None:
+        """Nothing is kept."""
+
+    def refine(self, objects: tuple[DetectedObject, ...]) -> tuple[DetectedObject, ...]:
+        """Return the objects as they are."""
+        return objects
+
+
 @dataclass(frozen=True, eq=False)
 class Stages:
     """The parts of a scan, chosen once.
@@ -95,6 +125,8 @@ class Stages:
         What is looked for, and with which cameras.
     detector, strategy
         Stages that keep a state of their own.
+    new_refiner
+        Makes the refiner of one scan.
     light
         From geometry to the probability of depth; its exposure is replaced by the applied one.
     left_out
@@ -104,6 +136,7 @@ class Stages:
     part: Part
     rig: StereoRig
     detector: Detector
+    new_refiner: Callable[[], PoseRefiner]
     strategy: Strategy
     light: LightModel
     left_out: tuple[str, ...]
@@ -153,7 +186,8 @@ def build_stages(
     detector = GivenObjects(objects) if objects is not None else _trained(recipe, part, rig, cache_dir, progress)
     strategy = strategy_of(recipe.planning.strategy, recipe.planning.seed)
     left_out = _left_out(recipe, part, given=objects is not None)
-    return Stages(part, rig, detector, strategy, light_model(recipe, part), left_out)
+    new_refiner = _refining(recipe.refinement, part, rig) if objects is None else AsDetected
+    return Stages(part, rig, detector, new_refiner, strategy, light_model(recipe, part), left_out)
 
 
 def light_model(recipe: Recipe, part: Part) -> LightModel:
@@ -182,10 +216,19 @@ def _trained(
     return detector
 
 
+def _refining(settings: RefinementSettings | None, part: Part, rig: StereoRig) -> Callable[[], PoseRefiner]:
+    if settings is None:
+        return AsDetected
+    from sidelong.detection.refinement import Refiner
+
+    return partial(Refiner, part, rig.left, settings)
+
+
 def _left_out(recipe: Recipe, part: Part, *, given: bool) -> tuple[str, ...]:
     """Name the terms that are not computed, each with the reason."""
     terms = {
-        "detection: left out, the poses are given": given,
+        "detection and refinement: left out, the poses are given": given,
+        "refinement of poses: left out, refinement is null": recipe.refinement is None and not given,
         "second camera: left out, sensing.stereo is off": not recipe.sensing.stereo,
         "light fall-off: left out, light.fall_off is off": not recipe.light.fall_off,
         "projector vignetting: left out, light.vignetting is 0": recipe.light.vignetting == 0,

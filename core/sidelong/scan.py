@@ -7,17 +7,19 @@ for step in scan(cell, stages, recipe, Stopwatch()):
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+from sidelong.detection.refinement import DepthView
 from sidelong.devices import CaptureRequest, Cell
+from sidelong.errors import DepthError
 from sidelong.fusion.completion import Completion
 from sidelong.geometry.transforms import invert
 from sidelong.planning.gain import Planner
-from sidelong.planning.prior import believe
+from sidelong.planning.prior import Belief, believe
 from sidelong.planning.selection import below_threshold, best_of
 from sidelong.recipe import PlanningSettings, Recipe, Stages
 from sidelong.stopwatch import Stopwatch
-from sidelong.types import BoolArray, Frame, Projector, Score, Step, Stop, View
+from sidelong.types import BoolArray, DetectedObject, Forecast, Frame, Projector, Score, Step, Stop, View
 
 
 def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> Iterator[Step]:
@@ -34,7 +36,7 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
     recipe
         Settings.
     stopwatch
-        Measures the stages capture, detect, score, move and fuse.
+        Measures the stages capture, detect, refine, score, move and fuse.
 
     Raises
     ------
@@ -48,7 +50,7 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
     depth_request = CaptureRequest(Projector.DOTS, recipe.depth_exposure_s, depth=True)
 
     # input of Algorithm 1: I_o with the projector off and a long exposure, and D_o
-    view = _move(cell, cell.reference, recipe, stopwatch)
+    reference = view = _move(cell, cell.reference, recipe, stopwatch)
     image = _capture(cell, view, CaptureRequest(Projector.OFF, recipe.image_exposure_s), stopwatch)
     frame = _capture(cell, view, depth_request, stopwatch)
     completion = Completion(frame, stages.rig.left, recipe.fusion)
@@ -58,59 +60,82 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
     with stopwatch.stage("detect"):
         objects = stages.detector.detect(image.left, completion.depth_m)
 
-    # 2: prior, {q} -> {D, N} at the missing pixels
-    with stopwatch.stage("score"):
-        belief = believe(
-            objects,
-            stages.part,
-            stages.rig.left,
-            view.base_T_camera,
-            missing_at_first,
-            recipe.planning.stride_px,
-        )
-        completion.expect(belief.surface_m)
-        light = replace(stages.light, exposure_s=frame.exposure_s)
-        planner = Planner(belief, stages.part, stages.rig, light)
-
-    taken = [view]
-    step = Step(
-        index=0, view=view, frame=frame, objects=objects, depth_m=completion.depth_m.copy(),
-        source=completion.source.copy(), doubtful=completion.doubtful, missing_px=int(belief.target.sum()),
-        recovered_px=0, predicted_gain_px=0.0, measured_gain_px=0.0, scores=(), stage_s={}, stop=None,
-        left_out=stages.left_out,
-    )  # fmt: skip
+    refiner = stages.new_refiner()
+    taken: list[View] = []
+    belief: Belief | None = None
+    planner: Planner | None = None
+    gained = _Gained()
     while True:
+        taken.append(view)
+
+        # every depth map says more of the poses; the paper leaves them as they were detected
+        with stopwatch.stage("refine"):
+            refiner.add(_depth_view(frame, view, reference))
+            refined: tuple[DetectedObject, ...] = refiner.refine(objects)
+
+        # 2: prior, {q} -> {D, N} at the missing pixels
+        if belief is None or refined is not objects:
+            with stopwatch.stage("score"):
+                belief = believe(
+                    refined, stages.part, stages.rig.left, reference.base_T_camera, missing_at_first,
+                    recipe.planning.stride_px,
+                )  # fmt: skip
+                completion.expect(belief.surface_m)
+            objects, planner = refined, None
+        doubtful = completion.doubtful
+        missing = completion.missing | doubtful
+        step = Step(
+            index=len(taken) - 1, view=view, frame=frame, objects=objects, depth_m=completion.depth_m.copy(),
+            source=completion.source.copy(), doubtful=doubtful, missing_px=int(belief.target.sum()),
+            recovered_px=int((belief.target & ~missing).sum()), predicted_gain_px=gained.predicted_px,
+            measured_gain_px=gained.measured_px, scores=(), stage_s={}, stop=None, left_out=stages.left_out,
+            forecast=gained.forecast,
+        )  # fmt: skip
+
         # 3: G_i of each candidate, equation (13), unless the scan ends here anyway
         stop, best = _spent(step, recipe.planning), None
-        missing = completion.missing | step.doubtful
         if stop is None:
             with stopwatch.stage("score"):
+                if planner is None:
+                    light = replace(stages.light, exposure_s=frame.exposure_s)
+                    planner = Planner(belief, stages.part, stages.rig, light)
                 step = replace(step, scores=_score(cell, stages, planner, taken, missing))
             best = best_of(step.scores)
             stop = _not_worth_it(step, best, recipe.planning)
 
         # 6: termination
-        step = replace(step, stage_s=stopwatch.lap(), stop=stop)
-        yield step
-        if stop is not None or best is None:
+        yield replace(step, stage_s=stopwatch.lap(), stop=stop)
+        if stop is not None or best is None or planner is None:
             return
 
         # 4: move to the argmax, equation (14)
         view = _move(cell, best.view, recipe, stopwatch)
-        taken.append(view)
 
         # 5: capture D*, fuse
         frame = _capture(cell, view, depth_request, stopwatch)
         with stopwatch.stage("fuse"):
             completion.add(frame)
-        doubtful = completion.doubtful
-        recovered_px = int((belief.target & ~completion.missing & ~doubtful).sum())
-        step = replace(
-            step, index=step.index + 1, view=view, frame=frame, depth_m=completion.depth_m.copy(),
-            source=completion.source.copy(), doubtful=doubtful, recovered_px=recovered_px,
-            predicted_gain_px=best.gain_px, measured_gain_px=float(recovered_px - step.recovered_px), scores=(),
-            forecast=planner.forecast(view, missing, completion.missing | doubtful),
-        )  # fmt: skip
+            still_missing = completion.missing | completion.doubtful
+        gained = _Gained(
+            predicted_px=best.gain_px,
+            measured_px=float((belief.target & missing & ~still_missing).sum()),
+            forecast=planner.forecast(view, missing, still_missing),
+        )
+
+
+@dataclass(frozen=True)
+class _Gained:
+    """What a view promised and what it gave, by the belief that chose it; nothing at the reference view."""
+
+    predicted_px: float = 0.0
+    measured_px: float = 0.0
+    forecast: Forecast | None = None
+
+
+def _depth_view(frame: Frame, view: View, reference: View) -> DepthView:
+    if frame.depth_m is None:
+        raise DepthError(f"view {view.name}: the frame has no depth map, it was captured without")
+    return DepthView(view.name, frame.depth_m, invert(reference.base_T_camera) @ view.base_T_camera)
 
 
 def _move(cell: Cell, view: View, recipe: Recipe, stopwatch: Stopwatch) -> View:

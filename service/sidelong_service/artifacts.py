@@ -15,9 +15,10 @@ import numpy as np
 
 from sidelong.evaluation.reliability import Reliability
 from sidelong.geometry.camera_model import PinholeCamera
+from sidelong.geometry.mesh import Part
 from sidelong.geometry.transforms import transform_points
 from sidelong.types import FloatArray, GrayImage, Step
-from sidelong_service.models import Artifact, Setup, ViewReport
+from sidelong_service.models import Artifact, Setup, ViewReport, rows_of
 
 DEPTH_UNIT_M = 1e-4
 """Of the 16-bit depth picture: 0.1 mm reaches 6.5 m, and is a sixth of what the sensor repeats to at 0.7 m."""
@@ -33,8 +34,8 @@ class Record:
 
     Attributes
     ----------
-    camera
-        Intrinsics of the reference view.
+    camera, part
+        Intrinsics of the reference view, and what is looked for.
     setup
         What the scan runs with.
     image
@@ -48,6 +49,7 @@ class Record:
     """
 
     camera: PinholeCamera
+    part: Part
     setup: Setup
     image: GrayImage | None = None
     views: list[ViewReport] = field(default_factory=list[ViewReport])
@@ -59,7 +61,7 @@ class Record:
         """Take a step in and return its report."""
         self.first, self.last = self.first or step, step
         self.reliability = self.reliability.add(step.forecast)
-        report = ViewReport.of(step)
+        report = ViewReport.of(step, self.first.view.base_T_camera)
         self.views.append(report)
         return report
 
@@ -83,6 +85,7 @@ def write_results(
         "depth.png": depth_png(_trusted_m(step)),
         "depth.npz": _depth_npz(step, record),
         "cloud.ply": _cloud(step, record),
+        "poses.json": _poses(step, record),
         **draw(record),
         "report.json": _report(step, record),
     }
@@ -133,6 +136,36 @@ def _depth_npz(step: Step, record: Record) -> bytes:
             "views": np.array([view.view for view in record.views]),
         }
     )
+
+
+def _poses(step: Step, record: Record) -> bytes:
+    """Return every hypothesis of every object: poses, probabilities, covariances."""
+    base_T_camera = _reference(record).view.base_T_camera
+    document = {
+        "part": record.part.name,
+        "diameter_m": record.part.diameter_m,
+        "reference": _reference(record).view.name,
+        "base_T_camera": rows_of(base_T_camera),
+        "covariance": "turn about the part's centre (rad), then shift (m), along the axes of the reference camera",
+        "objects": [
+            {
+                "visible_fraction": item.visible_fraction,
+                "supporting_views": item.supporting_views,
+                "hypotheses": [
+                    {
+                        "probability": each.probability,
+                        "score": each.score,
+                        "camera_T_object": rows_of(each.camera_T_object),
+                        "base_T_object": rows_of(base_T_camera @ each.camera_T_object),
+                        "covariance": None if each.covariance is None else rows_of(each.covariance),
+                    }
+                    for each in item.hypotheses
+                ],
+            }
+            for item in step.objects
+        ],
+    }
+    return json.dumps(document, indent=1, allow_nan=False).encode()
 
 
 def _report(step: Step, record: Record) -> bytes:

@@ -14,6 +14,7 @@ from sidelong.commissioning.documents import Document
 from sidelong.errors import SidelongError
 from sidelong.planning.selection import StrategyName
 from sidelong.recipe import Recipe
+from sidelong_service.bop_command import bop
 from sidelong_service.calibrate_command import calibrate
 from sidelong_service.client import SidelongClient
 from sidelong_service.command import (
@@ -29,7 +30,7 @@ from sidelong_service.command import (
     plain_errors,
     recipe_of,
 )
-from sidelong_service.console import CountedProgress, ScanProgress, comparison_table, view_table
+from sidelong_service.console import CountedProgress, ScanProgress, comparison_table, pose_table, view_table
 from sidelong_service.models import EventKind, RecordedScene, RunState, ScanRequest
 from sidelong_service.record_command import record
 
@@ -44,6 +45,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.add_typer(bop)
 app.add_typer(calibrate)
 app.add_typer(record)
 
@@ -111,6 +113,9 @@ def demo(
             scan_on_service(client, ScanRequest(part=part), output)
 
 
+REFINED = {"on": (True,), "off": (False,), "both": (False, True)}
+
+
 @app.command()
 def compare(
     dataset: Annotated[Path, typer.Argument(help="Folder of a data set in ROBI's layout.")],
@@ -121,6 +126,8 @@ def compare(
     strategies: Annotated[str, typer.Option(help="Of nbv, random, max_distance.")] = "nbv,random,max_distance",
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs of the random strategy.")] = 5,
     true_poses: Annotated[bool, typer.Option("--true-poses", help="Leave out detection; take the true poses.")] = False,
+    poses: Annotated[bool, typer.Option("--poses", help="Judge the poses as well (the paper's Table 2).")] = False,
+    refinement: Annotated[str, typer.Option(help="Of poses by depth: on, off (as the paper), or both.")] = "on",
     recipe: RecipeFile = None,
     calibration: Calibrations = None,
     config: ConfigFile = None,
@@ -141,11 +148,12 @@ def compare(
         comparison = Comparison(
             dataset=recorded,
             cases=cases_of(recorded, object_name, scene, names),
-            runs=_runs(strategies, seeds),
+            runs=_runs(strategies, seeds, refinement),
             recipe=settings.model_copy(update={"planning": planning}),
             cache_dir=load_settings(config).data_dir / "templates",
             true_poses=true_poses,
             documents=documents_of(calibration),
+            poses=poses,
         )
         _compare(comparison, json_file, plot)
 
@@ -155,13 +163,14 @@ def _compare(comparison: Comparison, json_file: Path | None, plot: Path) -> None
     from sidelong_service.artifacts import write_whole
 
     rows: list[Row] = []
-    total = len(comparison.cases) * len(comparison.runs) * comparison.recipe.planning.max_views
+    rows_each = len(comparison.runs) * (comparison.recipe.planning.max_views + comparison.poses)
+    total = len(comparison.cases) * rows_each
     ended_by: KeyboardInterrupt | SidelongError | None = None
     with CountedProgress(err) as progress:
 
         def skip(case: Case, why: str) -> None:
             nonlocal total
-            total -= len(comparison.runs) * comparison.recipe.planning.max_views
+            total -= rows_each
             progress.note(f"left out: {case.object} scene {case.scene} {case.reference}: {why}")
 
         def train(done: int, pictures: int) -> None:
@@ -188,17 +197,23 @@ def _compare(comparison: Comparison, json_file: Path | None, plot: Path) -> None
 
 
 def _show_comparison(rows: list[Row], plot: Path) -> None:
-    from sidelong.evaluation.tradeoff import draw, summarise
+    from sidelong.evaluation.tradeoff import draw, summarise, summarise_poses
     from sidelong_service.artifacts import write_whole
 
     points = summarise(rows)
     out.print(comparison_table(points))
+    judged = summarise_poses(rows)
+    if judged:
+        out.print(pose_table(judged))
     write_whole(plot, draw(points, f"{', '.join(dict.fromkeys(row.object for row in rows))}: {len(rows)} rows"))
     out.print(f"  {plot}", highlight=False, markup=False, soft_wrap=True)
 
 
-def _runs(strategies: str, seeds: int) -> tuple[Run, ...]:
+def _runs(strategies: str, seeds: int, refinement: str) -> tuple[Run, ...]:
     from sidelong.evaluation.compare import Run
+
+    if refinement not in REFINED:
+        raise CommandError(f"--refinement: {refinement!r} given, known are {', '.join(REFINED)}")
 
     known = [name.value for name in StrategyName]
     wanted = [name for name in strategies.split(",") if name]
@@ -206,8 +221,9 @@ def _runs(strategies: str, seeds: int) -> tuple[Run, ...]:
     if unknown or not wanted:
         raise CommandError(f"--strategies: {', '.join(unknown) or 'none'} given, known are {', '.join(known)}")
     return tuple(
-        Run(StrategyName(name), seed)
+        Run(StrategyName(name), seed, refined)
         for name in dict.fromkeys(wanted)
+        for refined in REFINED[refinement]
         for seed in range(seeds if name == StrategyName.RANDOM else 1)
     )
 

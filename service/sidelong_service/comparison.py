@@ -12,8 +12,9 @@ import numpy as np
 from sidelong.commissioning.documents import Document
 from sidelong.devices import Cell
 from sidelong.errors import DepthError
-from sidelong.evaluation.cases import Case, true_objects, truth_in
-from sidelong.evaluation.compare import Row, Run, compare_reference
+from sidelong.evaluation.cases import Case, judge_in, true_objects, truth_in
+from sidelong.evaluation.compare import Row, Run, Yardstick, compare_reference
+from sidelong.evaluation.pose_errors import PoseMetrics
 from sidelong.recipe import GivenObjects, Recipe, Stages, build_stages
 from sidelong.recorded.dataset import Dataset, Scene
 from sidelong.types import DetectedObject
@@ -42,6 +43,8 @@ class Comparison:
         Whether the true poses stand in for detection.
     documents
         Calibrations that go before what the recipe says.
+    poses
+        Whether poses are judged as well.
     """
 
     dataset: Dataset
@@ -51,6 +54,7 @@ class Comparison:
     cache_dir: Path
     true_poses: bool = False
     documents: tuple[Document, ...] = ()
+    poses: bool = False
 
     def rows(
         self, skipped: Callable[[Case, str], None], progress: Callable[[int, int], None] | None = None
@@ -87,6 +91,7 @@ class Comparison:
         job = RecordingJob(root=self.dataset.root, object=scene.object, scene=scene.number, reference=None)
         camera, arm = create_camera("replay", job.driver_settings()), create_arm("replay", job.driver_settings())
         views = scene.views()
+        metrics = PoseMetrics(stages.part, stages.rig.left) if self.poses else None
         with closing(camera), closing(arm):
             camera.open()
             arm.open()
@@ -102,4 +107,5 @@ class Comparison:
                 if self.true_poses:
                     mine = replace(stages, detector=GivenObjects(true_objects(scene, reference)))
                 cell = Cell(camera, arm, np.eye(4), reference, views)
-                yield from compare_reference(case, cell, mine, recipe, truth, self.runs)
+                yardstick = Yardstick(truth, judge_in(scene, reference, metrics) if metrics is not None else None)
+                yield from compare_reference(case, cell, mine, recipe, yardstick, self.runs)

@@ -20,10 +20,10 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from sidelong.evaluation.tradeoff import Point
+from sidelong.evaluation.tradeoff import Point, PosePoint
 from sidelong_service.models import EventKind, ViewReport
 
-STAGES = ("move", "capture", "detect", "score", "fuse")
+STAGES = ("move", "capture", "detect", "refine", "score", "fuse")
 
 
 class _Bars:
@@ -121,12 +121,34 @@ def comparison_table(points: Sequence[Point]) -> Table:
         table.add_column(name, justify="right")
     for point in points:
         table.add_row(
-            point.strategy.value,
+            point.label,
             str(point.views_added),
             f"{point.completeness:.1%}",
             f"{point.worst:.1%}",
             f"{point.compute_s:.2f}",
             f"{point.cell_s:.1f}",
             str(point.references),
+        )
+    return table
+
+
+def pose_table(points: Sequence[PosePoint]) -> Table:
+    """Return the table of the poses: the paper's rate and ADD, the same modulo symmetry, parts found, seconds."""
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("\nstrategy", no_wrap=True)
+    headers = "views\nadded", "ADD ok\n%", "ADD\nmm", "mod sym.\n%", "ADD\nmm", "MSSD\nmm", "found\n%", "comp.\ns"
+    for name in headers:
+        table.add_column(name, justify="right", no_wrap=True)
+    for point in points:
+        table.add_row(
+            point.label,
+            str(point.views_added),
+            f"{100 * point.rate:.1f}",
+            f"{point.add_m * 1e3:.2f}",
+            f"{100 * point.rate_symmetric:.1f}",
+            f"{point.add_symmetric_m * 1e3:.2f}",
+            f"{point.mssd_m * 1e3:.2f}",
+            f"{100 * point.recall:.1f}",
+            f"{point.compute_s:.2f}",
         )
     return table

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sidelong.commissioning.tasks import Task
 from sidelong.recipe import Recipe
-from sidelong.types import Step, Stop
+from sidelong.types import DetectedObject, FloatArray, Step, Stop
 from sidelong_service.problems import Problem
 from sidelong_service.settings import Name
 
@@ -102,12 +104,62 @@ class Candidate(_Answer):
     dropped: str | None
 
 
+class PoseReport(_Answer):
+    """Where an object is believed to be after a view: its most probable pose; all of them are in ``poses.json``.
+
+    Poses are 4x4 matrices in metres, row by row: in the base frame, and in the left camera of the reference view. The
+    sigmas are the largest over all directions, turns about the part's centre; none where no depth could tell.
+    ``visible_fraction`` is the share of the object's silhouette that no other object hides; ``supporting_views`` have
+    measured it.
+    """
+
+    base_T_object: tuple[tuple[float, ...], ...]
+    camera_T_object: tuple[tuple[float, ...], ...]
+    probability: float
+    score: float
+    hypotheses: int
+    rotation_sigma_rad: float | None
+    translation_sigma_m: float | None
+    visible_fraction: float
+    supporting_views: tuple[str, ...]
+
+    @classmethod
+    def of(cls, item: DetectedObject, base_T_camera: FloatArray) -> PoseReport:
+        """Return the report of an object seen from ``base_T_camera`` (4, 4)."""
+        best = item.hypotheses[0]
+        sigmas = (None, None) if best.covariance is None else sigmas_of(best.covariance)
+        return cls(
+            base_T_object=rows_of(base_T_camera @ best.camera_T_object),
+            camera_T_object=rows_of(best.camera_T_object),
+            probability=best.probability,
+            score=best.score,
+            hypotheses=len(item.hypotheses),
+            rotation_sigma_rad=sigmas[0],
+            translation_sigma_m=sigmas[1],
+            visible_fraction=item.visible_fraction,
+            supporting_views=item.supporting_views,
+        )
+
+
+def rows_of(matrix: FloatArray) -> tuple[tuple[float, ...], ...]:
+    """Return a matrix row by row."""
+    return tuple(tuple(float(value) for value in row) for row in matrix)
+
+
+def sigmas_of(covariance: FloatArray) -> tuple[float, float]:
+    """Return the largest standard deviations of turn (rad) and shift (m) of a (6, 6) covariance of a pose."""
+    turn, shift = (math.sqrt(max(0.0, float(np.linalg.eigvalsh(block)[-1]))) for block in
+                   (covariance[:3, :3], covariance[3:, 3:]))  # fmt: skip
+    return turn, shift
+
+
 class ViewReport(_Answer):
     """One view of a scan: the gain expected and measured, the state after it, and what it cost."""
 
     index: int
     view: str
     objects: int
+    poses: tuple[PoseReport, ...] = ()
     predicted_gain_px: float
     measured_gain_px: float
     missing_px: int
@@ -117,12 +169,13 @@ class ViewReport(_Answer):
     candidates: tuple[Candidate, ...]
 
     @classmethod
-    def of(cls, step: Step) -> ViewReport:
-        """Return the report of a step."""
+    def of(cls, step: Step, base_T_reference: FloatArray) -> ViewReport:
+        """Return the report of a step; ``base_T_reference`` (4, 4) is the camera at the reference view."""
         return cls(
             index=step.index,
             view=step.view.name,
             objects=len(step.objects),
+            poses=tuple(PoseReport.of(item, base_T_reference) for item in step.objects),
             predicted_gain_px=step.predicted_gain_px,
             measured_gain_px=step.measured_gain_px,
             missing_px=step.missing_px,
@@ -146,6 +199,8 @@ class Setup(_Answer):
     """What a scan runs with; ``recipe`` holds the settings in effect, those filled in from the cell or the data too."""
 
     part: str
+    repairs: tuple[str, ...] = ()
+    """What was mended in the CAD model."""
     camera: str
     arm: str
     width_px: int

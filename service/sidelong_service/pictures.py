@@ -1,4 +1,4 @@
-"""The pictures of a scan: what was missing, what is there now, from which view; and what the forecasts were worth."""
+"""The pictures of a scan: parts found, depth before and after, which view gave it, what forecasts were worth."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sidelong.evaluation import reliability
+from sidelong.evaluation.overlay import draw_overlay
 from sidelong.types import FloatArray, Step
 from sidelong_service.artifacts import Record
 
@@ -27,12 +28,29 @@ def draw(record: Record) -> dict[str, bytes]:
     ValueError
         The record has no reference view yet.
     """
-    pictures = {"picture.png": draw_depths(record)}
+    pictures = {"picture.png": draw_depths(record), "poses.png": draw_poses(record)}
     if record.reliability.forecasts:
         report = record.reliability.report()
         title = f"{record.setup.part}: forecasts of {report.views} views"
         pictures["reliability.png"] = reliability.draw(report, title)
     return pictures
+
+
+def draw_poses(record: Record) -> bytes:
+    """Return the mesh over the reference image as PNG, each object with its number and probability.
+
+    Raises
+    ------
+    ValueError
+        The record has no reference view yet.
+    """
+    if record.first is None or record.last is None:
+        raise ValueError("the record has no reference view yet")
+    image = record.image if record.image is not None else record.first.frame.left
+    objects = record.last.objects
+    sure = (item.hypotheses[0].probability for item in objects)
+    names = [str(index) if p > 0.995 else f"{index}: {p:.0%}" for index, p in enumerate(sure)]
+    return draw_overlay(image, record.part, record.camera, objects, names)
 
 
 def draw_depths(record: Record) -> bytes:

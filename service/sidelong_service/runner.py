@@ -78,7 +78,7 @@ class ScanRun:
         """
         camera = WatchedCamera(self.cell.camera)
         with build_stages(self.recipe, self.part, camera.rig, self.cache_dir, progress=self._progress) as stages:
-            record = Record(camera.rig.left, self._setup(stages))
+            record = Record(camera.rig.left, self.part, self._setup(stages))
             self.listener.note("setup", record.setup.model_dump())
             try:
                 self._take_views(replace(self.cell, camera=camera), stages, record)
@@ -108,6 +108,7 @@ class ScanRun:
     def _setup(self, stages: Stages) -> Setup:
         return Setup(
             part=self.part.name,
+            repairs=self.part.repairs,
             camera=self.cell.camera.name,
             arm=self.cell.arm.name,
             width_px=stages.rig.left.width,

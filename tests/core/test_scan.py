@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sidelong.detection.refinement import Refiner
+from sidelong.detection.refinement_settings import RefinementSettings
 from sidelong.devices import Cell
 from sidelong.errors import DepthError, DeviceTimeoutError, DeviceUnavailableError
-from sidelong.geometry.transforms import invert, transform
+from sidelong.geometry.transforms import invert, rotation_about, transform
 from sidelong.planning.candidates import DomeSettings, dome_views
 from sidelong.planning.selection import StrategyName
 from sidelong.recipe import PlanningSettings, Recipe, build_stages
@@ -36,7 +39,16 @@ class World:
 
 @pytest.fixture(scope="module")
 def world() -> Iterator[World]:
-    camera = SimulatedCamera(SimulatedCameraSettings(width=320, height=256, count=4))
+    yield from world_of(SimulatedCameraSettings(width=320, height=256, count=4))
+
+
+@pytest.fixture(scope="module")
+def sharp_world() -> Iterator[World]:
+    yield from world_of(SimulatedCameraSettings(width=640, height=512, count=4))
+
+
+def world_of(settings: SimulatedCameraSettings) -> Iterator[World]:
+    camera = SimulatedCamera(settings)
     camera.open()
     arm = opened_arm()
     camera_T_base = invert(VIEWS[0].base_T_camera)
@@ -119,7 +131,40 @@ def test_each_stage_is_timed_and_left_out_terms_are_named(steps: list[Step]) -> 
     assert {"move", "capture", "fuse"} <= steps[1].stage_s.keys()
     assert all(seconds >= 0 for step in steps for seconds in step.stage_s.values())
     assert any(term.startswith("inter-reflection: left out") for term in steps[0].left_out)
-    assert any(term.startswith("detection: left out") for term in steps[0].left_out)
+    assert any(term.startswith("detection and refinement: left out") for term in steps[0].left_out)
+
+
+def disturbed(world: World) -> tuple[DetectedObject, ...]:
+    """The true poses, 4 mm nearer and turned by 3 degrees about the camera's x axis, as a detector errs."""
+    turn = transform(rotation_about((1, 0, 0), np.radians(3.0)), (0.0, 0.0, -4e-3))
+    wrong: list[DetectedObject] = []
+    for item in world.objects:
+        pose = item.hypotheses[0].camera_T_object
+        here = transform(np.eye(3), pose[:3, 3])
+        wrong.append(surely(here @ turn @ invert(here) @ pose))
+    return tuple(wrong)
+
+
+def errors_m(world: World, step: Step) -> np.ndarray:
+    found = [item.hypotheses[0].camera_T_object[:3, 3] for item in step.objects]
+    return np.linalg.norm(
+        [a - b.hypotheses[0].camera_T_object[:3, 3] for a, b in zip(found, world.objects, strict=True)], axis=1
+    )
+
+
+def test_poses_are_refined_by_every_view_and_stay_as_detected_where_that_is_left_out(sharp_world: World) -> None:
+    world = sharp_world
+    recipe, objects = Recipe(planning=PlanningSettings(max_views=2)), disturbed(world)
+    with build_stages(recipe, world.camera.part, world.camera.rig, Path(), objects=objects) as stages:
+        as_detected = list(scan(world.cell, stages, recipe, Stopwatch()))
+        refining = replace(stages, new_refiner=partial(Refiner, stages.part, stages.rig.left, RefinementSettings()))
+        refined = list(scan(world.cell, refining, recipe, Stopwatch()))
+    assert all(step.objects is objects for step in as_detected)
+    assert np.median(errors_m(world, as_detected[-1])) == pytest.approx(4e-3)
+    assert np.median(errors_m(world, refined[-1])) < 2.2e-3  # one disparity is 6.6 mm at this distance
+    assert errors_m(world, refined[-1]).mean() < errors_m(world, refined[0]).mean() < 4e-3
+    assert {view for item in refined[-1].objects for view in item.supporting_views} == {s.view.name for s in refined}
+    assert all(item.hypotheses[0].covariance is not None for item in refined[-1].objects)
 
 
 def test_views_are_where_the_arm_says_it_is(world: World, steps: list[Step]) -> None:

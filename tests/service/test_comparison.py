@@ -216,7 +216,7 @@ def test_computing_adds_up_and_the_cell_adds_captures_and_moves(runs: list[list[
             assert all(row.stage_s[stage] >= seconds for stage, seconds in before.stage_s.items())
         for row in run[:5]:
             assert set(row.stage_s) >= {"move", "capture", "fuse"}
-            computed = {stage: row.stage_s.get(stage, 0.0) for stage in ("detect", "score", "fuse")}
+            computed = {stage: row.stage_s.get(stage, 0.0) for stage in ("detect", "refine", "score", "fuse")}
             assert row.compute_s == pytest.approx(sum(computed.values()))
             assert computed["fuse"] > 0
             stated_s = (row.views_added + 1) * CAPTURE_S + row.views_added * MOVE_S
@@ -245,8 +245,8 @@ def test_a_reference_without_true_depth_is_left_out_and_said_so(tmp_path: Path) 
 # --- the command ---
 
 KEYS = {
-    "object", "scene", "reference", "strategy", "seed", "views_added", "view", "completeness", "missing_px",
-    "predicted_gain_px", "measured_gain_px", "compute_s", "cell_s", "stage_s",
+    "object", "scene", "reference", "strategy", "refined", "seed", "views_added", "view", "completeness",
+    "poses", "missing_px", "predicted_gain_px", "measured_gain_px", "compute_s", "cell_s", "stage_s",
 }  # fmt: skip
 
 
@@ -278,11 +278,30 @@ def test_the_command_writes_rows_and_a_plot(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plot.png", "rows.json"]
 
 
+def test_the_command_judges_poses_as_detected_and_refined(tmp_path: Path) -> None:
+    """Depth brings the poses of the found parts nearer to the truth, and finds no fewer."""
+    asked = "--poses --refinement both --references 0 --views 1 --strategies nbv --json rows.json"
+    done = command(tmp_path, str(ROBI), *asked.split())
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert [(row["refined"], row["views_added"]) for row in rows] == [(False, 0), (False, 1), (True, 0), (True, 1)]
+    as_detected, _, alone, refined = (row["poses"] for row in rows)
+    assert as_detected == rows[1]["poses"]
+    assert as_detected["detected"] == refined["detected"] >= 8
+    assert as_detected["visible"] >= refined["found"] >= as_detected["found"] >= 5
+    assert refined["correct_symmetric"] >= 8
+    assert refined["add_symmetric_m"] < alone["add_symmetric_m"] < as_detected["add_symmetric_m"]
+    assert refined["add_symmetric_m"] < 1e-3
+    for label in ("single view unrefined", "single view ", "nbv unrefined", "nbv "):
+        assert label in done.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("nowhere",), "nowhere: no such data set folder"),
         ((str(ROBI), "--strategies", "nbv,best"), "--strategies: best given, known are nbv, random, max_distance"),
+        ((str(ROBI), "--refinement", "some"), "--refinement: 'some' given, known are on, off, both"),
         ((str(ROBI), "--object", "Gear"), "object 'Gear' is unknown, known are Tube_fitting"),
         ((str(ROBI), "--references", "6"), "reference 6 is out of range 0..5"),
     ],

@@ -94,7 +94,8 @@ def test_each_candidate_not_taken_has_its_reason(ended: dict[str, Any]) -> None:
 def test_the_views_and_the_results_are_all_there(service: ServiceProcess, ended: dict[str, Any]) -> None:
     names = [artifact["name"] for artifact in ended["artifacts"]]
     views = ["view_00.npz", "view_01.npz", "view_02.npz"]
-    assert names == [*views, "depth.png", "depth.npz", "cloud.ply", "picture.png", "reliability.png", "report.json"]
+    pictures = ["picture.png", "poses.png", "reliability.png"]
+    assert names == [*views, "depth.png", "depth.npz", "cloud.ply", "poses.json", *pictures, "report.json"]
     for artifact in ended["artifacts"]:
         assert len(read(service, ended, artifact["name"]).content) == artifact["size_bytes"]
 

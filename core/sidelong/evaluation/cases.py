@@ -9,6 +9,9 @@ import numpy as np
 
 from sidelong.errors import DepthError, UnknownNameError
 from sidelong.evaluation.metrics import Truth, truth_of
+from sidelong.evaluation.pose_errors import PoseMetrics
+from sidelong.evaluation.pose_score import PoseJudge
+from sidelong.evaluation.silhouettes import visible_fractions
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.transforms import invert
 from sidelong.recorded.dataset import Dataset, Scene
@@ -77,6 +80,15 @@ def truth_in(scene: Scene, reference: View, part: Part) -> Truth:
         [(part, pose) for pose in scene.base_T_objects],
         (scene.dataset.rig.left, reference.base_T_camera),
     )
+
+
+def judge_in(scene: Scene, reference: View, metrics: PoseMetrics) -> PoseJudge:
+    """Return what judges poses in a reference view."""
+    base_T_objects = scene.base_T_objects
+    visible = visible_fractions(
+        [(metrics.part, pose) for pose in base_T_objects], metrics.camera, reference.base_T_camera
+    )
+    return PoseJudge(metrics, invert(reference.base_T_camera) @ np.array(base_T_objects).reshape(-1, 4, 4), visible)
 
 
 def true_objects(scene: Scene, reference: View) -> tuple[DetectedObject, ...]:

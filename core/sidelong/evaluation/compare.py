@@ -11,13 +11,14 @@ from pydantic import BaseModel, ConfigDict
 from sidelong.devices import CaptureRequest, Cell
 from sidelong.evaluation.cases import Case
 from sidelong.evaluation.metrics import Truth
+from sidelong.evaluation.pose_score import PoseJudge, PoseScore
 from sidelong.planning.selection import StrategyName, strategy_of
-from sidelong.recipe import GivenObjects, Recipe, Stages
+from sidelong.recipe import AsDetected, GivenObjects, Recipe, Stages
 from sidelong.scan import scan
 from sidelong.stopwatch import Stopwatch
 from sidelong.types import Projector, Step
 
-COMPUTING = ("detect", "score", "fuse")
+COMPUTING = ("detect", "refine", "score", "fuse")
 """Stages that cost computing; the others cost the cell's time on a real cell and reading files on a recorded one."""
 
 
@@ -30,6 +31,8 @@ class Row(BaseModel):
     scene: int
     reference: str
     strategy: StrategyName
+    refined: bool = True
+    """Whether poses were refined by depth; else they stayed as detected, as in the paper."""
     seed: int
     views_added: int
     view: str | None
@@ -39,11 +42,13 @@ class Row(BaseModel):
     predicted_gain_px: float
     measured_gain_px: float
     compute_s: float
-    """Detecting, scoring and fusing, since the start of the run."""
+    """Detecting, refining, scoring and fusing, since the start of the run."""
     cell_s: float
     """``compute_s`` and the stated time of each capture and move."""
     stage_s: dict[str, float]
     """Seconds in each stage since the start of the run, as measured on the recorded views."""
+    poses: PoseScore | None = None
+    """Of the objects after this view, where they are judged."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +61,19 @@ class CellTime:
 
 @dataclass(frozen=True)
 class Run:
-    """One strategy, with the seed that matters to Random alone."""
+    """One strategy, with the seed that matters to Random alone, and whether depth refines the poses."""
 
     strategy: StrategyName
     seed: int = 0
+    refined: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Yardstick:
+    """What one reference view is measured by: true depth, and true poses if they are to be judged."""
+
+    truth: Truth
+    judge: PoseJudge | None = None
 
 
 def compare_reference(
@@ -67,11 +81,12 @@ def compare_reference(
     cell: Cell,
     stages: Stages,
     recipe: Recipe,
-    truth: Truth,
+    yardstick: Yardstick,
     runs: Sequence[Run],
     time: CellTime = CellTime(),
 ) -> Iterator[Row]:
-    """Run each strategy from one reference view and yield a row for each view added.
+    """Run each strategy from one reference view and yield a row for each view added; before them, where poses are
+    judged, one for the reference view alone.
 
     The image of the reference view is the same for all, so detection runs once and each run is charged for it.
     Thresholds of the gain are set aside: every run takes ``recipe.planning.max_views`` views if it can.
@@ -87,9 +102,14 @@ def compare_reference(
         planning = recipe.planning.model_copy(
             update={"strategy": run.strategy, "seed": run.seed, "gain_threshold_px": 0.0, "gain_threshold_share": 0.0}
         )
-        mine = replace(stages, detector=GivenObjects(objects), strategy=strategy_of(run.strategy, run.seed))
+        mine = replace(
+            stages,
+            detector=GivenObjects(objects),
+            new_refiner=stages.new_refiner if run.refined else AsDetected,
+            strategy=strategy_of(run.strategy, run.seed),
+        )
         steps = scan(cell, mine, recipe.model_copy(update={"planning": planning}), Stopwatch())
-        yield from _rows(case, run, truth, _charged(steps, detect_s), (planning.max_views, time))
+        yield from _rows(case, run, yardstick, _charged(steps, detect_s), (planning.max_views, time))
 
 
 def _charged(steps: Iterator[Step], detect_s: float) -> Iterator[Step]:
@@ -98,9 +118,12 @@ def _charged(steps: Iterator[Step], detect_s: float) -> Iterator[Step]:
         yield replace(step, stage_s={**step.stage_s, "detect": detect_s}) if step.index == 0 else step
 
 
-def _rows(case: Case, run: Run, truth: Truth, steps: Iterator[Step], limits: tuple[int, CellTime]) -> Iterator[Row]:
+def _rows(
+    case: Case, run: Run, yardstick: Yardstick, steps: Iterator[Step], limits: tuple[int, CellTime]
+) -> Iterator[Row]:
     """Turn the steps of a run into rows; a run that ended early keeps its last completeness."""
     max_views, time = limits
+    truth, judge = yardstick.truth, yardstick.judge
     spent_s, row = Counter[str](), None
     for step in steps:
         # a lap ends with the scores that choose the next view: they are not this view's cost yet
@@ -112,6 +135,7 @@ def _rows(case: Case, run: Run, truth: Truth, steps: Iterator[Step], limits: tup
             scene=case.scene,
             reference=case.reference,
             strategy=run.strategy,
+            refined=run.refined,
             seed=run.seed,
             views_added=step.index,
             view=step.view.name,
@@ -122,8 +146,9 @@ def _rows(case: Case, run: Run, truth: Truth, steps: Iterator[Step], limits: tup
             compute_s=compute_s,
             cell_s=compute_s + (step.index + 1) * time.capture_s + step.index * time.move_s,
             stage_s=dict(stage_s),
+            poses=None if judge is None else judge.score(step.objects),
         )
-        if step.index > 0:
+        if step.index > 0 or judge is not None:
             yield row
     if row is not None:
         for index in range(row.views_added + 1, max_views + 1):

@@ -28,6 +28,7 @@ class Point:
     """
 
     strategy: StrategyName
+    refined: bool
     views_added: int
     completeness: float
     worst: float
@@ -35,32 +36,127 @@ class Point:
     cell_s: float
     references: int
 
+    @property
+    def label(self) -> str:
+        """Strategy, and that its poses stayed as detected where they did."""
+        return label_of(self.strategy.value, self.refined)
+
+
+@dataclass(frozen=True)
+class PosePoint:
+    """Poses of a strategy after some views, over all objects of all references (and seeds).
+
+    Attributes
+    ----------
+    label
+        Of the strategy; views_added 0 is the reference view alone.
+    rate, add_m
+        Correct over detected objects, and the mean ADD of the correct ones: the paper's Table 2.
+    rate_symmetric, add_symmetric_m, mssd_m
+        The same modulo the part's symmetry, with the mean MSSD of the correct ones.
+    recall
+        Found over sufficiently visible parts, modulo symmetry.
+    compute_s
+        Mean over references.
+    """
+
+    label: str
+    views_added: int
+    rate: float
+    add_m: float
+    rate_symmetric: float
+    add_symmetric_m: float
+    mssd_m: float
+    recall: float
+    compute_s: float
+
+
+def label_of(name: str, refined: bool) -> str:
+    """Return what a strategy is called in tables and plots."""
+    return name if refined else f"{name} unrefined"
+
 
 def summarise(rows: Sequence[Row]) -> list[Point]:
     """Return a point for each strategy and number of views, strategies in the order of their first row."""
     points: list[Point] = []
-    for strategy in dict.fromkeys(row.strategy for row in rows):
-        for views_added in sorted({row.views_added for row in rows if row.strategy is strategy}):
-            mine = [row for row in rows if row.strategy is strategy and row.views_added == views_added]
-            places = list(dict.fromkeys((row.object, row.scene, row.reference) for row in mine))
-            means = np.array(
-                [
-                    np.mean(
-                        [
-                            (r.completeness, r.compute_s, r.cell_s)
-                            for r in mine
-                            if (r.object, r.scene, r.reference) == at
-                        ],
-                        axis=0,
-                    )
-                    for at in places
-                ]
-            )
-            completeness, compute_s, cell_s = (float(value) for value in means.mean(axis=0))
-            points.append(
-                Point(strategy, views_added, completeness, float(means[:, 0].min()), compute_s, cell_s, len(places))
-            )
+    for (strategy, refined, views_added), mine in _groups(rows):
+        places = list(dict.fromkeys((row.object, row.scene, row.reference) for row in mine))
+        means = np.array(
+            [
+                np.mean(
+                    [(r.completeness, r.compute_s, r.cell_s) for r in mine if (r.object, r.scene, r.reference) == at],
+                    axis=0,
+                )
+                for at in places
+            ]
+        )
+        completeness, compute_s, cell_s = (float(value) for value in means.mean(axis=0))
+        worst = float(means[:, 0].min())
+        if views_added > 0:
+            points.append(Point(strategy, refined, views_added, completeness, worst, compute_s, cell_s, len(places)))
     return points
+
+
+def summarise_poses(rows: Sequence[Row]) -> list[PosePoint]:
+    """Return a point for each strategy and number of views of the rows whose poses were judged.
+
+    The reference view alone is the same for all strategies and listed once for refined and unrefined poses each.
+    """
+    points: list[PosePoint] = []
+    alone: set[bool] = set()
+    for (strategy, refined, views_added), mine in _groups(rows):
+        scores = [row.poses for row in mine if row.poses is not None]
+        if not scores or (views_added == 0 and refined in alone):
+            continue
+        if views_added == 0:
+            alone.add(refined)
+        detected, correct, symmetric, visible, found = (
+            sum(getattr(score, name) for score in scores)
+            for name in ("detected", "correct", "correct_symmetric", "visible", "found")
+        )
+        means = {
+            name: _mean([(getattr(score, name), getattr(score, counted)) for score in scores])
+            for name, counted in (
+                ("add_m", "correct"),
+                ("add_symmetric_m", "correct_symmetric"),
+                ("mssd_m", "correct_symmetric"),
+            )
+        }
+        points.append(
+            PosePoint(
+                label=label_of(strategy.value if views_added else "single view", refined),
+                views_added=views_added,
+                rate=_share(correct, detected),
+                rate_symmetric=_share(symmetric, detected),
+                recall=_share(found, visible),
+                compute_s=float(np.mean([row.compute_s for row in mine])),
+                **means,
+            )
+        )
+    return points
+
+
+Key = tuple[StrategyName, bool, int]
+
+
+def _groups(rows: Sequence[Row]) -> list[tuple[Key, list[Row]]]:
+    """Return the rows of each strategy and number of views, strategies in the order of their first row."""
+    groups: dict[Key, list[Row]] = {}
+    runs = list(dict.fromkeys((row.strategy, row.refined) for row in rows))
+    for row in sorted(rows, key=lambda row: (runs.index((row.strategy, row.refined)), row.views_added)):
+        groups.setdefault((row.strategy, row.refined, row.views_added), []).append(row)
+    return list(groups.items())
+
+
+def _mean(values: Sequence[tuple[float | None, int]]) -> float:
+    """Return the mean of means weighted by their counts; NaN where nothing was counted."""
+    counted = [(value, count) for value, count in values if value is not None]
+    total = sum(count for _, count in counted)
+    return sum(value * count for value, count in counted) / total if total else float("nan")
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")
 
 
 def draw(points: Sequence[Point], title: str) -> bytes:
@@ -69,15 +165,15 @@ def draw(points: Sequence[Point], title: str) -> bytes:
 
     figure: Any = Figure(figsize=(12, 3.8), dpi=110, layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
-    for strategy in dict.fromkeys(point.strategy for point in points):
-        mine = [point for point in points if point.strategy is strategy]
+    for label in dict.fromkeys(point.label for point in points):
+        mine = [point for point in points if point.label == label]
         y = [100 * point.completeness for point in mine]
         for axis, x in zip(
             axes,
             ([p.views_added for p in mine], [p.compute_s for p in mine], [p.cell_s for p in mine]),
             strict=True,
         ):
-            axis.plot(x, y, marker="o", label=strategy.value)
+            axis.plot(x, y, marker="o", label=label)
     for axis, label in zip(axes, ("views added", "computing, s", "cell time, s"), strict=True):
         axis.set_xlabel(label)
         axis.set_xlim(left=0)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import random
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from sidelong.evaluation.compare import Row
-from sidelong.evaluation.tradeoff import Point, draw, summarise
+from sidelong.evaluation.pose_score import PoseScore
+from sidelong.evaluation.tradeoff import Point, draw, summarise, summarise_poses
 from sidelong.planning.selection import StrategyName
 
 NBV, RANDOM, FAR = StrategyName.NBV, StrategyName.RANDOM, StrategyName.MAX_DISTANCE
@@ -82,7 +84,46 @@ def test_the_order_of_the_rows_of_a_strategy_does_not_matter() -> None:
 
 
 def test_one_row_is_its_own_point() -> None:
-    assert summarise([row(NBV, "a", 0.25, views_added=3)]) == [Point(NBV, 3, 0.25, 0.25, 2.5, 25.0, 1)]
+    assert summarise([row(NBV, "a", 0.25, views_added=3)]) == [Point(NBV, True, 3, 0.25, 0.25, 2.5, 25.0, 1)]
+
+
+def judged(strategy: StrategyName, views_added: int, refined: bool, **score: Any) -> Row:
+    """A row whose poses were judged: of four detected objects so many correct, of five visible parts so many found."""
+    nothing = dict.fromkeys(("add_m", "add_symmetric_m", "adi_m", "mssd_m", "mspd_px", "rotation_rad"))
+    counts = {"detected": 4, "visible": 5, "found": 0, "correct": 0, "correct_symmetric": 0}
+    poses = PoseScore.model_validate({**nothing, **counts, **score})
+    return row(strategy, "a", 0.5, views_added=views_added).model_copy(update={"refined": refined, "poses": poses})
+
+
+def test_poses_are_counted_over_all_objects_and_errors_weighted_by_how_many_are_correct() -> None:
+    """3 of 4 and 1 of 4 are half of all; 1 mm of three and 5 mm of one are 2 mm."""
+    many = judged(NBV, 1, True, correct=3, add_m=1e-3, correct_symmetric=4, add_symmetric_m=2e-3, found=3, mssd_m=3e-3)
+    few = judged(NBV, 1, True, correct=1, add_m=5e-3, correct_symmetric=0, found=1)
+    (point,) = summarise_poses([many, few])
+    assert (point.rate, point.rate_symmetric, point.recall) == (0.5, 0.5, 0.4)
+    assert point.add_m == pytest.approx(2e-3)
+    assert (point.add_symmetric_m, point.mssd_m) == pytest.approx((2e-3, 3e-3))
+    assert point.label == "nbv"
+
+
+def test_the_reference_view_alone_is_listed_once_for_refined_and_unrefined_poses_each() -> None:
+    rows = [judged(s, n, refined) for s in (NBV, FAR) for refined in (False, True) for n in (0, 1)]
+    assert [(point.label, point.views_added) for point in summarise_poses(rows)] == [
+        ("single view unrefined", 0), ("nbv unrefined", 1), ("single view", 0), ("nbv", 1),
+        ("max_distance unrefined", 1), ("max_distance", 1),
+    ]  # fmt: skip
+    assert [(point.strategy, point.views_added) for point in summarise(rows)] == [
+        (NBV, 1),
+        (NBV, 1),
+        (FAR, 1),
+        (FAR, 1),
+    ]
+
+
+def test_where_nothing_was_detected_or_judged_there_is_no_number() -> None:
+    (point,) = summarise_poses([judged(NBV, 1, True, detected=0, visible=0)])
+    assert all(np.isnan([point.rate, point.add_m, point.rate_symmetric, point.mssd_m, point.recall]))
+    assert summarise_poses([row(NBV, "a", 0.5)]) == []
 
 
 def test_no_rows_give_no_points() -> None:
@@ -99,7 +140,7 @@ def picture(points: list[Point], title: str = "gear") -> np.ndarray:
 def test_the_plot_is_a_png_with_a_curve_for_each_strategy_in_three_panels() -> None:
     """Every further strategy brings its own colour into the left, the middle and the right third."""
     points = [
-        Point(strategy, n, 0.1 * n + 0.2 * at, 0.1, 0.3 * n, 4.0 * n, 2)
+        Point(strategy, True, n, 0.1 * n + 0.2 * at, 0.1, 0.3 * n, 4.0 * n, 2)
         for at, strategy in enumerate((NBV, RANDOM, FAR))
         for n in (1, 2, 3)
     ]
@@ -114,7 +155,7 @@ def test_the_plot_is_a_png_with_a_curve_for_each_strategy_in_three_panels() -> N
 
 
 def test_the_plot_shows_the_values_and_the_title() -> None:
-    low, high = ([Point(NBV, n, share * n, 0.1, 0.3 * n, 4.0 * n, 2) for n in (1, 2)] for share in (0.1, 0.3))
+    low, high = ([Point(NBV, True, n, share * n, 0.1, 0.3 * n, 4.0 * n, 2) for n in (1, 2)] for share in (0.1, 0.3))
     assert not np.array_equal(picture(low), picture(high))
     assert not np.array_equal(picture(low), picture(low, "another title"))
     np.testing.assert_array_equal(picture(low), picture(low))
