@@ -209,9 +209,9 @@ def light_model(recipe: Recipe, part: Part) -> LightModel:
 def _trained(
     recipe: Recipe, part: Part, rig: StereoRig, cache_dir: Path, progress: Callable[[int, int], None] | None
 ) -> Detector:
-    from sidelong.detection.line2d import Line2DDetector
+    from sidelong.detection.detector import TemplateDetector
 
-    detector = Line2DDetector(part, rig.left, recipe.detection, cache_dir)
+    detector = TemplateDetector(part, rig.left, recipe.detection, cache_dir)
     detector.prepare(progress)
     return detector
 

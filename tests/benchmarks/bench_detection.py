@@ -1,7 +1,8 @@
 """Detection on rendered heaps of shiny parts: what is found, how well, and in what time.
 
     python tests/benchmarks/bench_detection.py [--parts tube_fitting,gear,part.stl] [--grounds matte,printed]
-                                               [--seeds 0,1,2] [--set match_threshold=75 ...] [--no-depth] [--store DIR]
+                                               [--seeds 0,1,2] [--set match_threshold=4 ...] [--no-depth] [--store DIR]
+                                               [--proposals]
 
 Each scene is a heap of one part in a bin, seen from a view of the dome at 1280x1024 by the simulated camera: ground and
 bin plain (matte) or strongly textured (printed). Counted are the parts of which at least 60 % is unoccluded:
@@ -12,6 +13,12 @@ top 1      the most probable one is; both modulo the part's symmetry
 correct    ADI of the most probable one is below 10 % of the diameter
 false      objects per scene that lie on no part at all, however hidden
 match, s   seconds in the matcher, and beside it those of the rest of the detection; median over scenes
+
+With --proposals, what templates and matching alone are worth, for the same parts:
+
+match 15   a match is centred within a quarter of the diameter and within 15 degrees; 20: within 20 degrees
+first n    one of the first n poses of a cluster so placed is within 15 degrees
+no match   no template matches there at all; turned: none within 15 degrees; lost: one does, but no cluster has it
 """
 
 from __future__ import annotations
@@ -19,15 +26,22 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from sidelong.detection.line2d import Line2DDetector
+from sidelong.detection.depth_evidence import DistanceBounds
+from sidelong.detection.detector import TemplateDetector
+from sidelong.detection.matcher_process import MatcherProcess, Matches
+from sidelong.detection.proposals import Starts, poses_on_rays, propose
+from sidelong.detection.search_region import searched_image
 from sidelong.detection.settings import DetectionSettings
+from sidelong.detection.template_cache import load_or_train
+from sidelong.detection.templates import TemplateSet
 from sidelong.geometry.mesh import Part, load_part
 from sidelong.geometry.raycast import RayScene
 from sidelong.geometry.transforms import invert, transform, transform_points
@@ -126,6 +140,87 @@ class Tally:
             self.correct += min(errors_m, default=np.inf) < CORRECT * part.diameter_m
 
 
+@dataclass
+class Stages:
+    """Counts of how far the truth gets on its way to the verification."""
+
+    FIRST = (1, 4, 10, 40)
+
+    counted: int = 0
+    match_15: int = 0
+    match_20: int = 0
+    first: list[int] = field(default_factory=lambda: [0] * len(Stages.FIRST))
+    no_match: int = 0
+    lost: int = 0
+    matches: int = 0
+    capped: int = 0
+
+    def add(self, part: Part, case: Case, matches: Matches, templates: TemplateSet, clusters: list[Starts]) -> None:
+        """Count one scene."""
+        camera = rig_for(*SIZE_PX).left
+        uv = (matches.centre_px + 0.5) * camera.fx / templates.focal_px - 0.5
+        self.matches += matches.total
+        self.capped += matches.total > len(matches.row)
+        for pose in case.camera_T_objects[case.visible >= VISIBLE]:
+            self.counted += 1
+            centre_m = pose[:3, :3] @ part.centre_m + pose[:3, 3]
+            at_px, reach_px = camera.project(centre_m), NEAR * camera.fx * part.diameter_m / centre_m[2]
+            near = np.flatnonzero(np.linalg.norm(uv - at_px, axis=1) < reach_px)
+            matched = poses_on_rays(
+                uv[near], camera, templates.axis_R_object[matches.row[near]], templates.distance_m[matches.row[near]],
+                part.centre_m,
+            )  # fmt: skip
+            turns = part.symmetry.angle_rad(matched[:, :3, :3], pose[:3, :3])
+            ranks = [
+                rank
+                for starts in clusters
+                if np.linalg.norm(
+                    camera.project(starts.poses[0, :3, :3] @ part.centre_m + starts.poses[0, :3, 3]) - at_px
+                )
+                < reach_px
+                for rank in np.flatnonzero(part.symmetry.angle_rad(starts.poses[:, :3, :3], pose[:3, :3]) < ANGLE_RAD)
+            ]
+            self.no_match += len(near) == 0
+            self.match_15 += bool((turns < ANGLE_RAD).any())
+            self.match_20 += bool((turns < np.radians(20.0)).any())
+            self.lost += bool((turns < ANGLE_RAD).any()) and not ranks
+            self.first = [
+                n + (min(ranks, default=10**9) < limit) for n, limit in zip(self.first, self.FIRST, strict=True)
+            ]
+
+
+def proposed(
+    part: Part, ground: str, seeds: list[int], settings: DetectionSettings, options: argparse.Namespace
+) -> Iterator[str]:
+    """Match and cluster in each scene and yield the line of the table."""
+    camera, stages, times_s = rig_for(*SIZE_PX).left, Stages(), list[float]()
+    cases = [photographed(part, ground, seed, options.store) for seed in seeds]
+    reaching = around(cases, settings)
+    templates = load_or_train(part, camera, reaching, options.cache)
+    matcher = MatcherProcess(templates, reaching)
+    matcher.match(np.zeros((64, 64), np.uint8))  # loads the templates
+    for case in cases:
+        started = time.monotonic()
+        matches = matcher.match(searched_image(case.image, camera, templates.focal_px))
+        times_s.append(time.monotonic() - started)
+        bounds = DistanceBounds(None if options.no_depth else case.depth_m, reaching.reach_m, part.diameter_m)
+        stages.add(part, case, matches, templates, propose(matches, templates, bounds, reaching, (part, camera)))
+    matcher.close()
+    counted = max(stages.counted, 1)
+    shares = (
+        stages.match_15,
+        stages.match_20,
+        *stages.first,
+        stages.no_match,
+        counted - stages.match_15 - stages.no_match,
+    )
+    figures = " ".join(f"{100 * each / counted:8.1f}" for each in (*shares, stages.lost))
+    yield (
+        f"{part.name:14s} {ground:8s} {stages.counted:7d} {len(templates.distance_m):9d} {figures} "
+        f"{stages.matches // len(cases):9d} {stages.capped:6d} {np.median(times_s):9.2f}"
+    )
+
+
 def row(part: Part, ground: str, tally: Tally, times_s: list[tuple[float, float]]) -> str:
     """Return a line of the table."""
     counted = max(tally.counted, 1)
@@ -138,15 +233,20 @@ def row(part: Part, ground: str, tally: Tally, times_s: list[tuple[float, float]
     )
 
 
+def around(cases: list[Case], settings: DetectionSettings) -> DetectionSettings:
+    """Return the settings with the distances of the parts."""
+    deep = np.concatenate([case.camera_T_objects[:, 2, 3] for case in cases])
+    return settings.reaching(float(deep.min()) * 0.97, float(deep.max()) * 1.03)
+
+
 def measured(
     part: Part, ground: str, seeds: list[int], settings: DetectionSettings, options: argparse.Namespace
 ) -> Iterator[str]:
     """Detect in each scene and yield the line of the table."""
     tally, times_s = Tally(), list[tuple[float, float]]()
     cases = [photographed(part, ground, seed, options.store) for seed in seeds]
-    deep = np.concatenate([case.camera_T_objects[:, 2, 3] for case in cases])
-    reaching = settings.reaching(float(deep.min()) * 0.97, float(deep.max()) * 1.03)
-    with Line2DDetector(part, rig_for(*SIZE_PX).left, reaching, options.cache) as detector:
+    reaching = around(cases, settings)
+    with TemplateDetector(part, rig_for(*SIZE_PX).left, reaching, options.cache) as detector:
         detector.prepare()
         for case in cases:
             objects = detector.detect(case.image, None if options.no_depth else case.depth_m)
@@ -165,16 +265,25 @@ def main() -> int:
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the detection")
     parser.add_argument("--no-depth", action="store_true", help="detect in the image alone")
+    parser.add_argument("--proposals", action="store_true", help="what templates and matching alone are worth")
     parser.add_argument("--store", type=Path, default=None, help="keep rendered scenes here")
     parser.add_argument("--cache", type=Path, default=Path("templates"), help="trained templates")
     options = parser.parse_args()
     changed = {name: json.loads(value) for name, value in (each.split("=", 1) for each in options.set)}
     settings = DetectionSettings.model_validate(changed)
-    sys.stdout.write(f"{'part':14s} {'ground':8s} counted   found best 10   top 1 correct  false  match, s rest, s\n")
+    head = f"{'part':14s} {'ground':8s} counted "
+    if options.proposals:
+        head += "templates match 15 match 20 " + " ".join(f"{f'first {n}':>8s}" for n in Stages.FIRST)
+        head += " no match   turned     lost   matches capped  match, s"
+    else:
+        head += "  found best 10   top 1 correct  false  match, s rest, s"
+    sys.stdout.write(head + "\n")
     for name in options.parts.split(","):
         part = load_part(Path(name)) if Path(name).suffix else simulated_part(name)
         for ground in options.grounds.split(","):
-            for line in measured(part, ground, [int(seed) for seed in options.seeds.split(",")], settings, options):
+            for line in (proposed if options.proposals else measured)(
+                part, ground, [int(seed) for seed in options.seeds.split(",")], settings, options
+            ):
                 sys.stdout.write(line + "\n")
                 sys.stdout.flush()
     return 0

@@ -1,8 +1,8 @@
 """How well a pose explains the grey values around it, whatever the light.
 
 Under distant light, grey is a function of the normal alone (the reflectance map of shape from shading, Horn 1977).
-Each hypothesis gets the best smooth map, a cubic in the normal, fitted to the pixels it covers, and a constant
-background; the score is the share of variance explained. The contours alone confuse the ends of a part more often.
+Each hypothesis gets the best smooth map, a cubic in the normal, fitted to the pixels it covers; what speaks for it is the
+share of variance explained. The contours alone confuse the ends of a part more often.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sidelong.detection.settings import DetectionSettings
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.raycast import RayScene
@@ -25,8 +24,13 @@ GRID = 28
 PADDING = 1.1
 """Radius of the disc looked at, in radii of the part: some background belongs to the evidence."""
 RIDGE = 1e-2
+FACING = 0.9
+"""Cosine from which on a facet faces the viewer."""
 LEAST_FACING = 0.05
 """Share of a part's pixels that must face the viewer to tell how bright such facets are."""
+BRIGHT = 0.25
+LEAST_SPREAD = 1.0
+"""Grey levels below which differences are noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +58,12 @@ class Look:
 class AppearanceModel:
     """Renders poses of one part on a coarse disc of pixels."""
 
-    def __init__(self, part: Part, camera: PinholeCamera) -> None:
+    def __init__(self, part: Part, camera: PinholeCamera, grid: int = GRID) -> None:
         self._camera = camera
         self._centre_m = part.centre_m
         self._radius_m = part.diameter_m / 2
         self._scene = RayScene([(part, np.eye(4))])
-        ticks = (np.arange(GRID) + 0.5) / GRID * 2 - 1
+        ticks = (np.arange(grid) + 0.5) / grid * 2 - 1
         disc = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
         self._disc = disc[np.linalg.norm(disc, axis=1) < 1.0]
 
@@ -97,7 +101,7 @@ def grey_around(look: Look, smooth: NDArray[np.float32]) -> FloatArray:
 
 
 def explained_variance(look: Look, grey: FloatArray) -> FloatArray:
-    """Return the share (K,) 0..1 of the grey values' variance that normals and silhouette explain.
+    """Return the share (K,) 0..1 of the grey values' variance within the part that normals explain.
 
     Parameters
     ----------
@@ -106,26 +110,42 @@ def explained_variance(look: Look, grey: FloatArray) -> FloatArray:
     grey
         (K, Q) from ``grey_around``.
     """
-    basis = np.concatenate([_cubic(look.normals) * look.covered[..., None], ~look.covered[..., None]], axis=-1)
-    moments = np.swapaxes(basis, 1, 2) @ basis + RIDGE * np.eye(basis.shape[-1])
-    fitted: Any = np.linalg.solve(moments, np.swapaxes(basis, 1, 2) @ grey[..., None])
+    count = np.maximum(look.covered.sum(axis=1), 1)
+    mean = (grey * look.covered).sum(axis=1) / count
+    inside = (grey - mean[:, None]) * look.covered
+    return _explained(_cubic(look.normals) * look.covered[..., None], inside)
+
+
+def explained_around(look: Look, grey: FloatArray) -> FloatArray:
+    """Return the share (K,) 0..1 of the variance on the whole disc that normals and an even ground explain."""
+    return _explained(
+        np.concatenate([_cubic(look.normals) * look.covered[..., None], ~look.covered[..., None]], -1), grey
+    )
+
+
+def _explained(basis: FloatArray, grey: FloatArray) -> FloatArray:
+    transposed = np.swapaxes(basis, 1, 2)
+    moments = transposed @ basis + RIDGE * np.eye(basis.shape[-1])
+    fitted: Any = np.linalg.solve(moments, transposed @ grey[..., None])
     residual: FloatArray = grey - (basis @ fitted)[..., 0]
     total = (grey**2).sum(axis=1)
     return np.clip(1.0 - (residual**2).sum(axis=1) / np.maximum(total, 1e-9), 0.0, 1.0) * (total > 0)
 
 
-def faces_are_bright(look: Look, grey: FloatArray, settings: DetectionSettings) -> BoolArray:
-    """Say for which poses (K,) the facets that face the viewer are brighter than the ground around the part.
+def facing_brightness(look: Look, grey: FloatArray) -> FloatArray:
+    """Return (K,) -1..``BRIGHT`` how much brighter than the ground those facets are that face the viewer.
 
     They mirror the lights above the bin. On the dark walls of a bin, which have a part's width and straight edges, they
-    are not; where a pose shows hardly any such facet it says nothing, and passes.
+    do not. More than bright proves nothing: one glint is enough. In twice the standard deviations of the disc; 0 where
+    hardly any such facet is seen.
     """
-    facing = look.covered & (-look.normals[..., 2] >= settings.bright_cosine)
+    facing = look.covered & (-look.normals[..., 2] >= FACING)
     ground = ~look.covered
-    share = facing.sum(axis=1) / np.maximum(look.covered.sum(axis=1), 1)
+    enough = facing.sum(axis=1) >= LEAST_FACING * np.maximum(look.covered.sum(axis=1), 1)
     bright = (grey * facing).sum(axis=1) / np.maximum(facing.sum(axis=1), 1)
     dark = (grey * ground).sum(axis=1) / np.maximum(ground.sum(axis=1), 1)
-    return (bright > dark) | (share < LEAST_FACING)
+    spread = 2 * np.maximum(grey.std(axis=1), LEAST_SPREAD)
+    return np.where(enough, np.clip((bright - dark) / spread, -1.0, BRIGHT), 0.0)
 
 
 def _cubic(normals: FloatArray) -> FloatArray:

@@ -1,11 +1,12 @@
-"""From matches to objects: which matches are one object, which poses are one hypothesis, which objects are real."""
+"""Which matches are one object, which poses one hypothesis, and how probable each hypothesis is."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from sidelong.errors import SettingsError
-from sidelong.types import BoolArray, FloatArray, IntArray
+from sidelong.geometry.symmetry import Symmetry, no_symmetry
+from sidelong.types import FloatArray, IntArray
 
 
 def softmax(scores: FloatArray, temperature: float) -> FloatArray:
@@ -48,39 +49,23 @@ def cluster(uv: FloatArray, radius_px: FloatArray, max_clusters: int) -> list[In
     return clusters
 
 
-def distinct(rotations: FloatArray, distances_m: FloatArray, step_rad: float, limit: int) -> IntArray:
+def distinct(
+    rotations: FloatArray, distances_m: FloatArray, step_rad: float, limit: int, symmetry: Symmetry | None = None
+) -> IntArray:
     """Return the first of each group of like poses (at most ``limit``), in order: probabilities count poses once.
 
-    Poses are like where the turn between ``rotations`` (M, 3, 3) is below ``step_rad`` and the distances differ by a
-    ratio below ``1 + step_rad``: both move the contour of a part by about the same.
+    Poses are like where the turn between ``rotations`` (M, 3, 3), modulo the symmetry if there is one, is below
+    ``step_rad`` and the distances differ by a ratio below ``1 + step_rad``: both move the contour of a part by about
+    the same.
     """
+    symmetry = symmetry or no_symmetry(np.zeros(3))
+    left = np.arange(len(rotations))
     kept: list[int] = []
-    cosine = 1.0 + 2.0 * np.cos(step_rad)
-    for index in range(len(rotations)):
-        if len(kept) == limit:
-            break
-        traces = np.einsum("kij,ij->k", rotations[kept], rotations[index])
-        ratio = np.abs(np.log(distances_m[kept] / distances_m[index]))
-        if not ((traces > cosine) & (ratio < step_rad)).any():
-            kept.append(index)
+    while len(left) and len(kept) < limit:
+        kept.append(int(left[0]))
+        turn_rad = symmetry.angle_rad(rotations[left], rotations[left[0]])
+        ratio = np.abs(np.log(distances_m[left] / distances_m[left[0]]))
+        alike = (turn_rad < step_rad) & (ratio < step_rad)
+        alike[0] = True
+        left = left[~alike]
     return np.array(kept, dtype=np.intp)
-
-
-def uncovered(pixels: list[FloatArray], cell_px: float, overlap: float) -> BoolArray:
-    """Say which objects, best first, are covered by better ones by at most ``overlap`` of the smaller silhouette.
-
-    Parameters
-    ----------
-    pixels
-        For each object the pixels (Q, 2) of its silhouette, spaced by ``cell_px`` or less.
-    cell_px
-        Size of the cells on which silhouettes are compared.
-    overlap
-        Largest share 0..1.
-    """
-    kept = np.zeros(len(pixels), dtype=np.bool_)
-    cells = [{(int(u), int(v)) for u, v in np.floor(found / cell_px)} for found in pixels]
-    for index, mine in enumerate(cells):
-        shares = (len(mine & cells[j]) / max(1, min(len(mine), len(cells[j]))) for j in np.flatnonzero(kept))
-        kept[index] = len(mine) > 0 and all(share <= overlap for share in shares)
-    return kept

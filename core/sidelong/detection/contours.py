@@ -1,47 +1,39 @@
-"""The visible contours of a posed part, and its alignment to the edges of an image.
+"""The visible contours of a posed part, and the edges of an image.
 
-Contours are points on edges of the mesh where brightness is expected to step: silhouettes and creases alike. Alignment
-is the classic search along the contour's normals (Harris, RAPID, 1990), with weighted Gauss-Newton steps in the pose.
+Contours are points on edges of the mesh where brightness is expected to step: silhouettes and creases alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sidelong.detection.settings import DetectionSettings
 from sidelong.detection.shading import brightness
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part, simplified
 from sidelong.geometry.raycast import RayScene
-from sidelong.geometry.transforms import invert, rotation_about
+from sidelong.geometry.transforms import invert
 from sidelong.types import BoolArray, FloatArray, GrayImage, IntArray
 
 MAX_TRIANGLES = 2500
-POINT_SPACING = 0.05
-"""Of the points on mesh edges, in diameters of the part."""
 LIFT = 0.004
 """How far points are lifted before their visibility is tested, in diameters: the mesh was simplified."""
 LEAST_STEP = 0.1
 """Contrast below which an edge is none: facets of a tessellated round are not seen one by one."""
-SEARCH_SPANS = (0.07, 0.07, 0.05, 0.05, 0.035, 0.035, 0.025, 0.025)
-"""Half-lengths of the search along the normals, one for each step, in diameters of the part on the image."""
-FINE_SPANS = SEARCH_SPANS[4:]
-SEARCH_STEPS = 6
-DAMPING = 1e-3
-LARGEST_TURN_RAD = 0.15
 
 
 @dataclass(frozen=True, eq=False)
 class ContourPoints:
-    """Points and tangents (K, P, 3) in the object frame, and which are visible (K, P)."""
+    """Points and tangents (K, P, 3) in the object frame, which are visible and which on the silhouette (K, P)."""
 
     points: FloatArray
     tangents: FloatArray
     visible: BoolArray
+    silhouette: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +58,7 @@ class EdgeField:
         strength = np.linalg.norm(gradient, axis=-1, keepdims=True)
         noise = max(1.5 * float(np.median(strength)), 0.5)
         self._field = gradient / (strength + noise)
+        self.strength: NDArray[np.float32] = (strength / (strength + noise))[..., 0]
 
     def agreement(self, uv: FloatArray, normals: FloatArray) -> FloatArray:
         """Return |gradient . normal| (K, ...) at pixels (K, ..., 2); 0 outside the image."""
@@ -83,81 +76,44 @@ class ContourModel:
     def __init__(self, part: Part, settings: DetectionSettings) -> None:
         self._settings = settings
         self._diameter_m = part.diameter_m
-        self._centre_m = part.centre_m
         coarse = simplified(part, MAX_TRIANGLES)
         self._scene = RayScene([(coarse, np.eye(4))])
-        edges, faces = _shared_edges(coarse)
-        start, end = coarse.vertices_m[edges[:, 0]], coarse.vertices_m[edges[:, 1]]
-        length = np.linalg.norm(end - start, axis=1)
-        count = np.maximum(1, np.ceil(length / (POINT_SPACING * part.diameter_m))).astype(np.intp)
-        row = np.repeat(np.arange(len(edges)), count)
-        along = (np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[row]
-        self._points = start[row] + (end - start)[row] * along[:, None]
-        self._tangents = (end - start)[row]
-        self._weight = (length / count)[row]
-        self._normals = coarse.triangle_normals[faces[row]]
-        self._offsets = (self._normals * self._points[:, None]).sum(axis=-1)
-        self._outward = self._normals.sum(axis=1)
+        corners = coarse.vertices_m[coarse.triangles]
+        self._normals = coarse.triangle_normals.astype(np.float32)
+        self._middles = corners.mean(axis=1).astype(np.float32)
+        edges, self._faces = _shared_edges(coarse)
+        self._start = coarse.vertices_m[edges[:, 0]]
+        self._tangents = coarse.vertices_m[edges[:, 1]] - self._start
+        self._length = np.linalg.norm(self._tangents, axis=1).astype(np.float32)
+        self._outward = coarse.triangle_normals[self._faces].sum(axis=1)
 
     def select(self, camera_T_object: FloatArray, rng: np.random.Generator) -> ContourPoints:
         """Draw ``contour_points`` for each pose (K, 4, 4), in proportion to length times expected contrast."""
         eye = invert(camera_T_object)[:, :3, 3]
-        # n . (eye - p) as one matrix product: most of the time of a detection is spent here
-        height = (eye @ self._normals.reshape(-1, 3).T).reshape(len(eye), -1, 2) - self._offsets
-        distance = np.linalg.norm(eye[:, None] - self._points, axis=-1)
-        level = brightness(height / distance[..., None], self._settings)
-        contrast = np.abs(level[..., 0] - level[..., 1])
-        share = np.cumsum(self._weight * np.where(contrast >= LEAST_STEP, contrast, 0.0), axis=1)
+        cosine = self._cosines(eye.astype(np.float32))
+        level = brightness(cosine, self._settings).astype(np.float32)
+        contrast = np.abs(level[:, self._faces[:, 0]] - level[:, self._faces[:, 1]])
+        contrast[contrast < LEAST_STEP] = 0.0
+        share = np.cumsum(self._length * contrast, axis=1, dtype=np.float64)
         count = self._settings.contour_points
         drawn = (np.arange(count) + rng.random((len(eye), 1))) / count * share[:, -1:]
-        chosen = np.empty(drawn.shape, dtype=np.intp)
-        for row, (cumulated, wanted) in enumerate(zip(share, drawn, strict=True)):
-            chosen[row] = np.searchsorted(cumulated, wanted)
-        chosen = np.minimum(chosen, len(self._points) - 1)
-        lifted = self._points[chosen] + LIFT * self._diameter_m * self._outward[chosen]
-        hidden = self._scene.blocked(lifted, eye[:, None])
-        return ContourPoints(self._points[chosen], self._tangents[chosen], ~hidden)
+        chosen = np.stack([np.searchsorted(*each) for each in zip(share, drawn, strict=True)])
+        chosen = np.minimum(chosen, len(self._length) - 1)
+        upto, rows = np.take_along_axis(share, chosen, axis=1), np.arange(len(eye))[:, None]
+        weight = (self._length[chosen] * contrast[rows, chosen]).astype(np.float64)
+        along = np.clip(1.0 - (upto - drawn) / np.maximum(weight, 1e-12), 0.0, 1.0)
+        points = self._start[chosen] + self._tangents[chosen] * along[..., None]
+        hidden = self._scene.blocked(points + LIFT * self._diameter_m * self._outward[chosen], eye[:, None])
+        away = cosine[rows[..., None], self._faces[chosen]] <= 0
+        silhouette: BoolArray = away.any(axis=-1)
+        return ContourPoints(points, self._tangents[chosen], ~hidden & (weight > 0), silhouette)
 
-    def agreement(self, field: EdgeField, camera: PinholeCamera, camera_T_object: FloatArray) -> FloatArray:
-        """Return how well the contours of poses (K, 4, 4) lie on edges, 0..1 (K,)."""
-        contour = self.select(camera_T_object, np.random.default_rng(0))
-        seen = project(contour, camera, camera_T_object)
-        agreement = field.agreement(seen.uv, seen.normals) * contour.visible
-        # few visible points prove little: a quarter of the points is the least divisor
-        return agreement.sum(axis=1) / np.maximum(contour.visible.sum(axis=1), self._settings.contour_points / 4)
-
-    def align(
-        self,
-        field: EdgeField,
-        camera: PinholeCamera,
-        camera_T_object: FloatArray,
-        limits_m: FloatArray,
-        spans: Sequence[float] = SEARCH_SPANS,
-    ) -> FloatArray:
-        """Move poses (K, 4, 4) so that their contours lie on edges; return them, (K, 4, 4).
-
-        The centres of the parts stay between the distances ``limits_m`` (K, 2). ``spans`` are the half-lengths of the
-        search, one for each step, in diameters of the part on the image.
-        """
-        rng = np.random.default_rng(0)
-        poses = camera_T_object.copy()
-        contour = self.select(poses, rng)
-        for step, span in enumerate(spans):
-            if step == len(spans) // 2:
-                contour = self.select(poses, rng)
-            seen = project(contour, camera, poses)
-            reach_px = span * camera.fx * self._diameter_m / poses[:, 2, 3]
-            shift_px, weight = _search(field, seen, reach_px)
-            twist = _twist(seen, camera, poses, shift_px, weight * contour.visible, self._diameter_m)
-            poses = self._kept_between(_moved(poses, twist), limits_m)
-        return poses
-
-    def _kept_between(self, poses: FloatArray, limits_m: FloatArray) -> FloatArray:
-        """Scale poses along their lines of sight until their centres lie between the limits."""
-        centre_m = poses[:, :3, :3] @ self._centre_m + poses[:, :3, 3]
-        wanted_m = np.clip(centre_m[:, 2], limits_m[:, 0], limits_m[:, 1])
-        poses[:, :3, 3] += centre_m * (wanted_m / centre_m[:, 2] - 1.0)[:, None]
-        return poses
+    def _cosines(self, eye: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the cosines (K, F) between the faces' normals and the directions to the viewer at (K, 3)."""
+        # n . (eye - p) is the same all over a face, so its sign is exact: silhouettes depend on it
+        height = eye @ self._normals.T - (self._normals * self._middles).sum(axis=1)
+        squared = (eye**2).sum(axis=1)[:, None] - 2 * eye @ self._middles.T + (self._middles**2).sum(axis=1)
+        return height / np.sqrt(np.maximum(squared, 1e-12))
 
 
 def project(contour: ContourPoints, camera: PinholeCamera, camera_T_object: FloatArray) -> Projected:
@@ -183,55 +139,3 @@ def _shared_edges(part: Part) -> tuple[IntArray, IntArray]:
     edges, owner = edges[order], owner[order]
     first = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
     return edges[first], np.stack([owner[first], owner[first + 1]], axis=1)
-
-
-def _search(field: EdgeField, seen: Projected, reach_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return, for each point, how far along its normal the best edge lies (K, P) px and its weight (K, P)."""
-    steps = np.arange(-SEARCH_STEPS, SEARCH_STEPS + 1) / SEARCH_STEPS
-    offsets = reach_px[:, None, None] * steps
-    where = seen.uv[:, :, None] + offsets[..., None] * seen.normals[:, :, None]
-    response = field.agreement(where, seen.normals[:, :, None])
-    # nearer edges win over slightly better ones further off
-    best = (response * (1.0 - 0.4 * np.abs(steps))).argmax(axis=-1)
-    inner = np.clip(best, 1, 2 * SEARCH_STEPS - 1)
-    before, peak, after = (np.take_along_axis(response, (inner + k)[..., None], -1)[..., 0] for k in (-1, 0, 1))
-    curvature = before - 2 * peak + after
-    bends = (curvature < -1e-6) & (inner == best)
-    parabola = np.where(bends, 0.5 * (before - after) / np.where(bends, curvature, -1.0), 0.0)
-    share = steps[best] + np.clip(parabola, -0.5, 0.5) / SEARCH_STEPS
-    weight = np.take_along_axis(response, best[..., None], -1)[..., 0] / (1.0 + (2.0 * share) ** 2)
-    return share * reach_px[:, None], weight
-
-
-def _twist(
-    seen: Projected, camera: PinholeCamera, poses: FloatArray, shift_px: FloatArray, weight: FloatArray, size_m: float
-) -> FloatArray:
-    """Return the damped Gauss-Newton step (K, 6): rotation about the object's origin (rad), translation (m)."""
-    x, y, z = np.moveaxis(seen.points_camera, -1, 0)
-    u, v = seen.normals[..., 0] * camera.fx / z, seen.normals[..., 1] * camera.fy / z
-    by_translation = np.stack([u, v, -(u * x + v * y) / z], axis=-1)
-    by_rotation = np.cross(seen.points_camera - poses[:, None, :3, 3], by_translation)
-    # half the part's size makes metres comparable to radians
-    scale_m = size_m / 2
-    jacobian = np.concatenate([by_rotation, by_translation * scale_m], axis=-1)
-    weighted = jacobian * weight[..., None]
-    normal: FloatArray = np.swapaxes(weighted, 1, 2) @ jacobian
-    damping: FloatArray = DAMPING * np.trace(normal, axis1=1, axis2=2) / 6 + 1e-9
-    right: FloatArray = np.einsum("kpi,kp->ki", weighted, shift_px)
-    solved: Any = np.linalg.solve(normal + damping[:, None, None] * np.eye(6), right[..., None])
-    step: FloatArray = solved[..., 0]
-    step[:, 3:] *= scale_m
-    return step
-
-
-def _moved(poses: FloatArray, twist: FloatArray) -> FloatArray:
-    """Return poses (K, 4, 4) turned and shifted by ``twist`` (K, 6), the turn limited."""
-    moved = poses.copy()
-    moved[:, :3, 3] += twist[:, 3:]
-    for pose, turn in zip(moved, twist[:, :3], strict=True):
-        angle = float(np.linalg.norm(turn))
-        if angle > 1e-9:
-            pose[:3, :3] = rotation_about(turn, min(angle, LARGEST_TURN_RAD)) @ pose[:3, :3]
-    # an object cannot pass through the camera, whatever its neighbourhood suggests
-    moved[:, 2, 3] = np.clip(moved[:, 2, 3], 0.7 * poses[:, 2, 3], 1.4 * poses[:, 2, 3])
-    return moved

@@ -87,19 +87,12 @@ def offsets(residual_m: FloatArray, covered: BoolArray, reach_m: float) -> Float
     return np.where(enough, middle, 0.0)
 
 
-def contradicted(residual_m: FloatArray, covered: BoolArray, tolerance_m: float) -> FloatArray:
-    """Return the share (K,) 0..1 of the covered pixels where a measured depth says that something else is seen.
-
-    An opaque part cannot be looked through, and where something stands before it its grey values are not its own. Where
-    nothing was measured nothing is said: shiny parts lose most of their depth.
-    """
-    return (np.abs(residual_m) > tolerance_m).sum(axis=1) / np.maximum(covered.sum(axis=1), 1)
-
-
 def sampled(depth_m: FloatArray, uv: FloatArray) -> FloatArray:
     """Return the depth (...) at the nearest pixel centres to pixels (..., 2); NaN outside the image."""
-    column, row = np.rint(np.moveaxis(uv, -1, 0)).astype(np.intp)
     height, width = depth_m.shape
+    # a part at the camera projects to anywhere, also to where no integer is
+    anywhere = np.nan_to_num(np.moveaxis(uv, -1, 0), nan=-1.0)
+    column, row = np.rint(np.clip(anywhere, -1.0, max(height, width))).astype(np.intp)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return np.where(inside, depth_m[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)], np.nan)
 

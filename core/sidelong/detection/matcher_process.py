@@ -1,8 +1,8 @@
-"""Line2D in a process of its own: it can die or hang without taking the scan along."""
+"""The matcher in a process of its own: it can die or hang without taking the scan along."""
 
 from __future__ import annotations
 
-import json
+import os
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -10,23 +10,21 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any
 
-import numpy as np
-
 from sidelong.detection.settings import DetectionSettings
-from sidelong.detection.templates import PYRAMID, TemplateSet
+from sidelong.detection.templates import TemplateSet
 from sidelong.errors import DetectionError, MatcherDiedError
-from sidelong.types import FloatArray, GrayImage, IntArray
-
-ALIGNMENT_PX = 32
-"""Line2D with T = (4, 8) ends the process on other image sizes (OpenCV 5.0)."""
+from sidelong.types import BoolArray, FloatArray, GrayImage, IntArray
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Matches, best first: corners (M, 2) as (u, v), similarity (M,) 0..100, template rows (M,), and all found."""
+    """Matches, best first: centres (M, 2) as (u, v), scores (M,), template rows (M,), and all found.
 
-    corner_px: FloatArray
-    similarity: FloatArray
+    A score counts standard deviations of the background, see :mod:`.matched_filter`.
+    """
+
+    centre_px: FloatArray
+    score: FloatArray
     row: IntArray
     total: int
 
@@ -48,25 +46,27 @@ class MatcherProcess:
         """Process id of the child, None where there is none."""
         return None if self._child is None else self._child.pid
 
-    def match(self, image: GrayImage) -> Matches:
+    def match(self, image: GrayImage, region: BoolArray | None = None) -> Matches:
         """Search the image (H, W), already at the templates' focal length.
+
+        Parameters
+        ----------
+        image
+            8-bit grey.
+        region
+            (H, W) pixels where parts can be: edges elsewhere do not count, and no part is centred there.
 
         Raises
         ------
         MatcherDiedError
             The child died or missed the deadline; the next call starts another one.
         DetectionError
-            OpenCV refused the image.
+            The matcher refused the image.
         """
-        rows, columns = image.shape
-        padding = ((0, -rows % ALIGNMENT_PX), (0, -columns % ALIGNMENT_PX))
-        padded = np.pad(image, padding, mode="edge")
-        answer = self._ask((padded, self._settings.match_threshold, self._settings.max_matches))
+        answer = self._ask((image, region, self._settings.model_dump()))
         if isinstance(answer, str):
-            raise DetectionError(f"matcher: OpenCV refused the image of {columns}x{rows} px: {answer}")
-        found, total = answer
-        names = found[:, 3:].astype(np.intp)
-        return Matches(found[:, :2], found[:, 2], self._templates.rows(names[:, 0], names[:, 1]), int(total))
+            raise DetectionError(f"matcher: refused the image of {image.shape[1]}x{image.shape[0]} px: {answer}")
+        return Matches(*answer)
 
     def close(self) -> None:
         """End the child. Harmless when repeated."""
@@ -89,19 +89,13 @@ class MatcherProcess:
 
     def _start(self) -> Connection[Any, Any]:
         ours, theirs = Pipe()
-        options = {
-            "weak": self._settings.weak_threshold,
-            "strong": self._settings.strong_threshold,
-            "features": self._templates.num_features,
-            "pyramid": list(PYRAMID),
-            "classes": list(self._templates.classes),
-        }
         descriptor = theirs.fileno()
         # in a session of its own: Ctrl-C is for us, and the child ends when our end of the pipe does
         self._child = subprocess.Popen(
-            [sys.executable, "-m", "sidelong.detection.matcher_child", str(descriptor),
-             str(self._templates.folder), json.dumps(options)],
+            [sys.executable, "-m", "sidelong.detection.matcher_child", str(descriptor), str(self._templates.folder)],
             pass_fds=[descriptor], stdin=subprocess.DEVNULL, start_new_session=True,
+            # it has threads of its own: those of the linear algebra wait for each other wherever a core is busy
+            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
         )  # fmt: skip
         theirs.close()
         self._channel = ours

@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 DistanceM = Annotated[FiniteFloat, Field(ge=0.01, le=20)]
+Pixel = Annotated[int, Field(ge=0, le=100_000)]
 USUAL_DISTANCE_M = (0.55, 0.95)
 """Of a camera over a bin, where nothing tells."""
 
@@ -15,9 +16,8 @@ USUAL_DISTANCE_M = (0.55, 0.95)
 class DetectionSettings(BaseModel):
     """Which templates are made of a part, how they are matched, and what becomes of the matches.
 
-    The defaults won error against run time on a bin of hexagonal steel fittings, 84 px long at 1280x1024: 12,720
-    templates (view 20, turn 15 degrees, span 60 px) train in 8-11 s, match in 0.2-0.3 s, and propose a pose within 15
-    degrees of 98-100 % of the parts; 33,120 (15, 10, span 80) take 43 s and 0.5-0.9 s for the same share.
+    Error against run time of templates and matching: ``python tests/benchmarks/bench_detection.py --proposals``, with
+    ``--set cell_px=5`` and the like for other points of the plot.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -33,12 +33,12 @@ class DetectionSettings(BaseModel):
     """Largest ratio of neighbouring distances: what an image shows changes with the ratio, not the difference."""
     span_px: Annotated[FiniteFloat, Field(ge=24, le=400)] = 60.0
     """What the part's diameter spans in the matched image at the middle distance; images are resized to reach it."""
-    num_features: Annotated[int, Field(ge=16, le=63)] = 63
-    """Features of a template; fewer are used where the part does not offer as many. OpenCV raises above 63."""
-    weak_threshold: Annotated[FiniteFloat, Field(gt=0)] = 10.0
-    """Gradient below which a pixel of the image has no direction (Sobel of the blurred 8-bit image)."""
-    strong_threshold: Annotated[FiniteFloat, Field(gt=0)] = 150.0
-    """Gradient a feature of a template needs, same unit; templates use the full range 0..255."""
+    cell_px: Annotated[int, Field(ge=2, le=32)] = 6
+    """Spacing of the grid on which templates and image are compared, in pixels of the matched image."""
+    weak_gradient: Annotated[FiniteFloat, Field(gt=0)] = 3.0
+    """Gradient of the image, grey levels per pixel, at which a lonely edge counts half: a few times the noise."""
+    strong_gradient: Annotated[FiniteFloat, Field(gt=0)] = 12.0
+    """The same for the pictures of the templates, which use the full range 0..255."""
     dark_cosine: Annotated[FiniteFloat, Field(ge=0, le=1)] = 0.3
     """Facets tilted further from the viewer than this cosine mirror the dark bin instead of the lights above."""
     bright_cosine: Annotated[FiniteFloat, Field(ge=0, le=1)] = 0.9
@@ -46,35 +46,35 @@ class DetectionSettings(BaseModel):
     dark_level: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.1
     """Brightness of the dark facets relative to the bright ones."""
     ground_level: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.2
-    """Brightness of what parts lie on, relative to the bright facets. With 0, 0.2 and 0.35 the best hypothesis lay
-    within 10 % of the diameter for 163, 171 and 84 of 200 recorded fittings, 91, 103 and 56 of 128 simulated eye bolts
-    (min_score 40)."""
-    match_threshold: Annotated[FiniteFloat, Field(ge=50, le=99)] = 72.0
-    """Least similarity of a match, 0..100. Chance alone reaches 84 on noise, and 100 finds nothing at all."""
+    """Brightness of what parts lie on, relative to the bright facets."""
+    region_px: tuple[Pixel, Pixel, Pixel, Pixel] | None = None
+    """(left, top, right, bottom) of the rectangle in which parts are looked for, the last two exclusive; none: all."""
+    match_threshold: Annotated[FiniteFloat, Field(gt=0, le=50)] = 3.0
+    """Least score of a match, in standard deviations of the edges that the image has anywhere."""
+    matches_per_place: Annotated[int, Field(ge=1, le=1000)] = 40
+    """Templates kept for each point of the grid, best first."""
     max_matches: Annotated[int, Field(ge=1)] = 100_000
-    """Matches kept, best first; textured images have millions."""
+    """Matches kept, best first."""
     deadline_s: Annotated[FiniteFloat, Field(gt=0)] = 60.0
     """Time the matcher's process has to load the templates or to answer before it is ended."""
     cluster_radius: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.2
     """Matches whose centres lie within this share of the part's diameter may be one object."""
     pose_step_deg: Annotated[FiniteFloat, Field(gt=0, le=90)] = 12.0
-    """Hypotheses of one object that differ by less before alignment count as one; a third of it after."""
+    """Hypotheses of one object that differ by less count as one."""
     hypotheses_per_object: Annotated[int, Field(ge=1, le=50)] = 10
     """Hypotheses kept for each object."""
     max_objects: Annotated[int, Field(ge=1, le=500)] = 40
     """Objects reported, best first."""
     contour_points: Annotated[int, Field(ge=32, le=1000)] = 160
     """Points on the contours of a hypothesis that alignment and score look at."""
-    overlap: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.3
+    overlap: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.4
     """An object whose silhouette is covered further than this by a better object's is a false alarm."""
-    min_score: Annotated[FiniteFloat, Field(ge=0, le=100)] = 45.0
-    """Score the best hypothesis of an object needs: the mean of contour agreement and explained variance, percent."""
-    bright_faces: bool = True
-    """Whether facets that face the viewer mirror light and are brighter than the ground; off for black parts."""
-    depth_tolerance: Annotated[FiniteFloat, Field(gt=0, le=10)] = 0.15
-    """How far a measured depth may differ from a hypothesis before it speaks against it, in diameters of the part."""
-    temperature: Annotated[FiniteFloat, Field(gt=0)] = 4.0
-    """Of the softmax over the hypotheses of an object, on the 0..100 scale of the scores."""
+    min_score: Annotated[FiniteFloat, Field(ge=0, le=100)] = 25.0
+    """Probability, percent, that the best hypothesis of an object needs, as if it were the only one."""
+    temperature: Annotated[FiniteFloat, Field(gt=0)] = 0.3
+    """Of the softmax over the log-odds of the hypotheses of an object."""
+    least_probability: Annotated[FiniteFloat, Field(ge=0, lt=0.5)] = 1e-3
+    """Hypotheses of an object that are less probable are dropped; the others' probabilities sum to 1 again."""
 
     @property
     def reach_m(self) -> tuple[float, float]:
@@ -96,6 +96,10 @@ class DetectionSettings(BaseModel):
     def _ordered(self) -> DetectionSettings:
         if not self.reach_m[0] <= self.reach_m[1]:
             raise ValueError(f"distance_m is {self.distance_m}, the first must not exceed the second")
+        if self.region_px is not None and not (
+            self.region_px[0] < self.region_px[2] and self.region_px[1] < self.region_px[3]
+        ):
+            raise ValueError(f"region_px is {self.region_px}, needs left < right and top < bottom")
         if not self.dark_cosine < self.bright_cosine:
             raise ValueError(f"dark_cosine is {self.dark_cosine}, must be below bright_cosine, {self.bright_cosine}")
         return self

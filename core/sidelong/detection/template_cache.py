@@ -8,24 +8,24 @@ import os
 import shutil
 import tempfile
 import zipfile
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from sidelong.detection.settings import DetectionSettings
-from sidelong.detection.templates import Progress, TemplateSet, train
+from sidelong.detection.templates import FILE, Progress, TemplateSet, train
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
 
-FORMAT = 1
+FORMAT = 2
 """Raise it when training or the files change."""
 TRAINING_SETTINGS = {
-    "view_step_deg", "roll_step_deg", "distance_m", "distance_ratio", "span_px", "num_features",
-    "weak_threshold", "strong_threshold", "dark_cosine", "bright_cosine", "dark_level",
-    "ground_level",
+    "view_step_deg", "roll_step_deg", "distance_m", "distance_ratio", "span_px", "cell_px", "strong_gradient",
+    "dark_cosine", "bright_cosine", "dark_level", "ground_level",
 }  # fmt: skip
-ARRAYS = ("class_index", "template_id", "axis_R_object", "distance_m", "centre_px")
+AT_WORK = "training-"
+"""Prefix of the folder of a training at work; the id of its process follows."""
 
 
 def load_or_train(
@@ -44,7 +44,8 @@ def load_or_train(
     if stored is not None:
         return stored
     cache_dir.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix="training-", dir=cache_dir))
+    _remove_abandoned(cache_dir)
+    fresh = Path(tempfile.mkdtemp(prefix=f"{AT_WORK}{os.getpid()}-", dir=cache_dir))
     try:
         _write(train(part, camera, settings, fresh, progress))
         shutil.rmtree(entry, ignore_errors=True)
@@ -65,6 +66,9 @@ def load_or_train(
 def cache_key(part: Part, camera: PinholeCamera, settings: DetectionSettings) -> str:
     """Return the entry's name: the part's and a digest of everything that shapes the templates."""
     digest = hashlib.sha256(part.vertices_m.tobytes() + part.triangles.astype(np.int64).tobytes())
+    symmetry = part.symmetry
+    digest.update(np.round(symmetry.rotations, 6).tobytes())
+    digest.update(repr((symmetry.ball, None if symmetry.axis is None else symmetry.axis.round(6).tolist())).encode())
     content = {
         "format": FORMAT,
         "camera": asdict(camera),
@@ -75,25 +79,42 @@ def cache_key(part: Part, camera: PinholeCamera, settings: DetectionSettings) ->
     return f"{safe}-{digest.hexdigest()[:20]}"
 
 
+def size_bytes(cache_dir: Path) -> int:
+    """Return what the cache takes on the disk; it grows with every part, camera and setting, and may be deleted."""
+    return sum(path.stat().st_size for path in cache_dir.rglob("*") if path.is_file())
+
+
+def _remove_abandoned(cache_dir: Path) -> None:
+    """Remove what trainings left behind whose process was killed."""
+    for folder in cache_dir.glob(f"{AT_WORK}*"):
+        process = folder.name.removeprefix(AT_WORK).split("-")[0]
+        if not process.isdigit() or not _alive(int(process)):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _alive(process_id: int) -> bool:
+    try:
+        os.kill(process_id, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
 def _write(templates: TemplateSet) -> None:
-    """Write what is not in OpenCV's files beside them, with their digests."""
-    folder = templates.folder
-    np.savez(folder / "poses.npz", **{name: getattr(templates, name) for name in ARRAYS})
-    digests = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
-    rest = {f.name: getattr(templates, f.name) for f in fields(templates) if f.name not in (*ARRAYS, "folder")}
-    (folder / "entry.json").write_text(json.dumps({"digests": digests, **rest}))
+    """Write what is needed to check the file beside it."""
+    digest = hashlib.sha256((templates.folder / FILE).read_bytes()).hexdigest()
+    (templates.folder / "entry.json").write_text(json.dumps({"digest": digest, "focal_px": templates.focal_px}))
 
 
 def _read(entry: Path) -> TemplateSet | None:
     """Return the entry, or None where it is missing or a file of it is not what was written."""
     try:
         content = json.loads((entry / "entry.json").read_text())
-        for name, digest in content.pop("digests").items():
-            # OpenCV's reader is not to be trusted with a damaged file
-            if hashlib.sha256((entry / name).read_bytes()).hexdigest() != digest:
-                return None
-        content["classes"] = tuple(content["classes"])
-        with np.load(entry / "poses.npz") as arrays:
-            return TemplateSet(folder=entry, **content, **{name: arrays[name] for name in ARRAYS})
+        if hashlib.sha256((entry / FILE).read_bytes()).hexdigest() != content["digest"]:
+            return None
+        with np.load(entry / FILE) as arrays:
+            return TemplateSet(entry, float(content["focal_px"]), arrays["axis_R_object"], arrays["distance_m"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile):
         return None

@@ -1,30 +1,33 @@
-"""Hypothesis verification: aligns poses with what was seen, and says how well each explains it."""
+"""Hypothesis verification: aligns poses with what was seen, and says how probable each is."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sidelong.detection.appearance import (
-    AppearanceModel,
-    Look,
-    explained_variance,
-    faces_are_bright,
-    grey_around,
-    smoothed,
-)
-from sidelong.detection.contours import FINE_SPANS, ContourModel, EdgeField
-from sidelong.detection.depth_evidence import contradicted, offsets, residuals
+from sidelong.detection.alignment import Aligner
+from sidelong.detection.appearance import AppearanceModel, Look, smoothed
+from sidelong.detection.contours import ContourModel, EdgeField
+from sidelong.detection.features import Features, contour_features, depth_features, grey_features
+from sidelong.detection.plausibility import log_odds
+from sidelong.detection.proposals import Starts
 from sidelong.detection.settings import DetectionSettings
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
 from sidelong.types import FloatArray, GrayImage
 
+T = TypeVar("T")
+
 BATCH = 48
 """Poses worked on at a time: many enough that numpy's calls cost nothing, few enough for the processor's cache."""
+THREADS = 2
+GLANCE_GRID = 16
+"""Pixels looked at across a part's diameter while its pose is not exact."""
 
 
 class Evidence:
@@ -37,44 +40,35 @@ class Evidence:
 
 
 @dataclass(frozen=True, eq=False)
-class Starts:
-    """Poses (K, 4, 4) before alignment, and how near and far (K, 2) their centres may be, in metres."""
-
-    poses: FloatArray
-    limits_m: FloatArray
-
-    def __getitem__(self, chosen: slice) -> Starts:
-        return Starts(self.poses[chosen], self.limits_m[chosen])
-
-    @staticmethod
-    def joined(parts: Sequence[Starts]) -> Starts:
-        """Concatenate; none gives none."""
-        return Starts(
-            np.concatenate([np.zeros((0, 4, 4)), *(part.poses for part in parts)]),
-            np.concatenate([np.zeros((0, 2)), *(part.limits_m for part in parts)]),
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class Verified:
-    """Aligned poses (K, 4, 4), their scores (K,) 0..100, and the pixels (Q, 2) each covers."""
+    """Aligned poses.
+
+    Attributes
+    ----------
+    poses
+        (K, 4, 4) ``camera_T_object``.
+    log_odds
+        (K,) that each is right, as if it were the only one.
+    silhouettes
+        For each the pixels (Q, 2) that it covers, with the depth of its surface there: (Q, 3).
+    """
 
     poses: FloatArray
-    scores: FloatArray
-    silhouettes_px: tuple[FloatArray, ...]
+    log_odds: FloatArray
+    silhouettes: tuple[FloatArray, ...]
 
     def __getitem__(self, chosen: slice | Sequence[int]) -> Verified:
         index = range(len(self.poses))[chosen] if isinstance(chosen, slice) else chosen
-        silhouettes = tuple(self.silhouettes_px[k] for k in index)
-        return Verified(self.poses[list(index)], self.scores[list(index)], silhouettes)
+        silhouettes = tuple(self.silhouettes[k] for k in index)
+        return Verified(self.poses[list(index)], self.log_odds[list(index)], silhouettes)
 
     @staticmethod
     def joined(parts: Sequence[Verified]) -> Verified:
         """Concatenate; none gives none."""
         return Verified(
             np.concatenate([np.zeros((0, 4, 4)), *(part.poses for part in parts)]),
-            np.concatenate([np.zeros(0), *(part.scores for part in parts)]),
-            tuple(silhouette for part in parts for silhouette in part.silhouettes_px),
+            np.concatenate([np.zeros(0), *(part.log_odds for part in parts)]),
+            tuple(silhouette for part in parts for silhouette in part.silhouettes),
         )
 
 
@@ -83,42 +77,51 @@ class Verifier:
 
     def __init__(self, part: Part, camera: PinholeCamera, settings: DetectionSettings) -> None:
         self._camera = camera
-        self._settings = settings
-        self._centre_m = part.centre_m
         self._diameter_m = part.diameter_m
         self._contours = ContourModel(part, settings)
         self._appearance = AppearanceModel(part, camera)
+        self._glance = AppearanceModel(part, camera, GLANCE_GRID)
+        self._aligner = Aligner(part, camera, self._contours, self._glance)
 
     def verify(self, starts: Starts, evidence: Evidence) -> Verified:
-        """Align poses and score them.
+        """Align poses and say how probable each is. Contours, appearance and depth speak; see ``features``."""
+        return Verified.joined(_in_batches(lambda batch: self._verify(batch, evidence), starts))
 
-        The score is 50 (contour agreement + explained variance), less the share of pixels that a measured depth
-        contradicts. Contours place a part exactly, its appearance tells its ends and faces apart, and depth its
-        distance.
-        """
-        batches = (starts[first : first + BATCH] for first in range(0, len(starts.poses), BATCH))
-        return Verified.joined([self._verify(batch, evidence) for batch in batches])
+    def glance(self, starts: Starts, evidence: Evidence) -> tuple[Starts, FloatArray]:
+        """Return poses moved to where they were measured, and how promising each (K,) is as it stands: log-odds."""
+        parts = _in_batches(lambda batch: self._glance_at(batch, evidence), starts)
+        moved, odds = [each[0] for each in parts], [each[1] for each in parts]
+        return Starts.joined(moved), np.concatenate([np.zeros(0), *odds])
+
+    def aligned(self, starts: Starts, evidence: Evidence) -> tuple[FloatArray, Look, Features]:
+        """Return aligned poses (K, 4, 4), what they look like, and what speaks for and against them."""
+        poses = self._aligner.align(starts.poses, starts.limits_m, evidence.edges, evidence.depth_m)
+        look = self._appearance.look(poses)
+        return poses, look, self._features(poses, look, evidence)
+
+    def _features(self, poses: FloatArray, look: Look, evidence: Evidence) -> Features:
+        features = {
+            **contour_features(self._contours, evidence.edges, self._camera, poses, self._diameter_m),
+            **grey_features(look, evidence.smooth),
+        }
+        if evidence.depth_m is not None:
+            features |= depth_features(look, evidence.depth_m, self._diameter_m)
+        return features
 
     def _verify(self, starts: Starts, evidence: Evidence) -> Verified:
-        poses = self._contours.align(evidence.edges, self._camera, starts.poses, starts.limits_m)
-        look, doubt = self._appearance.look(poses), np.zeros(len(poses))
-        if evidence.depth_m is not None:
-            poses = self._at_measured_distance(poses, look, evidence.edges, evidence.depth_m)
-            look = self._appearance.look(poses)
-            tolerance_m = self._settings.depth_tolerance * self._diameter_m
-            doubt = contradicted(residuals(look, evidence.depth_m), look.covered, tolerance_m)
-        grey = grey_around(look, evidence.smooth)
-        agreement = self._contours.agreement(evidence.edges, self._camera, poses)
-        appearance = explained_variance(look, grey)
-        if self._settings.bright_faces:
-            appearance *= faces_are_bright(look, grey, self._settings)
-        scores = 50 * (agreement + appearance) * (1.0 - doubt)
-        silhouettes = tuple(uv[covered] for uv, covered in zip(look.uv, look.covered, strict=True))
-        return Verified(poses, scores, silhouettes)
+        poses, look, features = self.aligned(starts, evidence)
+        surface = np.concatenate([look.uv, look.depth_m[..., None]], axis=-1)
+        silhouettes = tuple(each[covered] for each, covered in zip(surface, look.covered, strict=True))
+        return Verified(poses, log_odds(features), silhouettes)
 
-    def _at_measured_distance(self, poses: FloatArray, look: Look, edges: EdgeField, depth_m: FloatArray) -> FloatArray:
-        """Move poses to where they were measured, and align the rest of each pose anew."""
-        further_m = offsets(residuals(look, depth_m), look.covered, self._diameter_m / 2)
-        distance_m = (poses[:, :3, :3] @ self._centre_m)[:, 2] + poses[:, 2, 3] + further_m
-        fixed_m = np.stack([distance_m, distance_m], axis=-1)
-        return self._contours.align(edges, self._camera, poses, fixed_m, FINE_SPANS)
+    def _glance_at(self, starts: Starts, evidence: Evidence) -> tuple[Starts, FloatArray]:
+        poses = self._aligner.at_measured_distance(starts.poses, evidence.depth_m)
+        look = self._glance.look(poses)
+        return Starts(poses, starts.limits_m), log_odds(self._features(poses, look, evidence))
+
+
+def _in_batches(work: Callable[[Starts], T], starts: Starts) -> list[T]:
+    """Do the work on batches of poses, in threads: numpy, OpenCV and Open3D let go of the interpreter."""
+    batches = [starts[slice(first, first + BATCH)] for first in range(0, len(starts.poses), BATCH)]
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(work, batches))

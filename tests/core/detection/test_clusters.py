@@ -1,12 +1,13 @@
-"""Softmax, clusters, like poses and covered silhouettes, against closed forms."""
+"""Softmax, clusters and like poses, against closed forms."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sidelong.detection.clusters import cluster, distinct, softmax, uncovered
+from sidelong.detection.clusters import cluster, distinct, softmax
 from sidelong.errors import SettingsError
+from sidelong.geometry.symmetry import Symmetry
 from sidelong.geometry.transforms import rotation_about
 
 
@@ -68,13 +69,8 @@ def test_distinct_tells_distances_apart_and_stops_at_the_limit():
     assert distinct(same, distances_m, np.radians(12), limit=2).tolist() == [0, 2]
 
 
-def test_uncovered_drops_the_weaker_of_two_that_overlap():
-    u, v = np.meshgrid(np.arange(40.0), np.arange(40.0))
-    square = np.stack([u.ravel(), v.ravel()], axis=-1)
-    shifted = [square + np.array([offset, 0.0]) for offset in (0.0, 20.0, 36.0, 200.0)]
-    # half of the second is covered, a tenth of the third, nothing of the fourth
-    assert uncovered(shifted, cell_px=4.0, overlap=0.3).tolist() == [True, False, True, True]
-
-
-def test_uncovered_drops_what_lies_nowhere():
-    assert uncovered([np.zeros((0, 2))], cell_px=4.0, overlap=0.3).tolist() == [False]
+def test_distinct_counts_poses_once_that_the_symmetry_makes_equal():
+    rotations = np.stack([rotation_about((0, 0, 1), np.radians(a)) for a in (0, 90, 45, 185)])
+    square = Symmetry(np.zeros(3), np.stack([rotation_about((0, 0, 1), np.radians(a)) for a in (0, 90, 180, 270)]))
+    assert distinct(rotations, np.full(4, 0.7), np.radians(12), limit=10).tolist() == [0, 1, 2, 3]
+    assert distinct(rotations, np.full(4, 0.7), np.radians(12), limit=10, symmetry=square).tolist() == [0, 2]

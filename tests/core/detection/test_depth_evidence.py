@@ -7,8 +7,8 @@ import pytest
 from detection_scene import CAMERA, bracket, photograph, true_poses
 
 from sidelong.detection.appearance import AppearanceModel
-from sidelong.detection.depth_evidence import HEAP, DistanceBounds, contradicted, offsets, residuals, sampled
-from sidelong.detection.line2d import Line2DDetector
+from sidelong.detection.depth_evidence import HEAP, DistanceBounds, offsets, residuals, sampled
+from sidelong.detection.detector import TemplateDetector
 from sidelong.detection.settings import DetectionSettings
 from sidelong.errors import SettingsError
 from sidelong.geometry.raycast import RayScene
@@ -81,11 +81,6 @@ def test_too_few_measured_pixels_leave_the_distance_alone():
     assert offsets(np.full((1, 100), np.nan), np.ones((1, 100), dtype=np.bool_), 0.02) == pytest.approx([0.0])
 
 
-def test_only_pixels_that_were_measured_can_contradict():
-    residual_m = np.array([[0.001, 0.05, -0.05, np.nan, np.nan], [np.nan] * 5])
-    assert contradicted(residual_m, np.ones((2, 5), dtype=np.bool_), 0.01) == pytest.approx([0.4, 0.0])
-
-
 def test_a_part_at_its_place_leaves_no_residual_and_one_that_is_further_leaves_its_distance():
     truth = true_poses()[0]
     depth_m = RayScene([(bracket(), truth)]).render(CAMERA, np.eye(4)).depth_m
@@ -103,7 +98,7 @@ def test_measured_depth_corrects_the_distance_of_a_detection(tmp_path_factory: p
     truths = true_poses()
     seen = RayScene([(bracket(), pose) for pose in truths]).render(CAMERA, np.eye(4))
     half = np.where(np.arange(CAMERA.width) % 3 == 0, np.nan_to_num(seen.depth_m, nan=0.75), np.nan)
-    with Line2DDetector(bracket(), CAMERA, settings, tmp_path_factory.mktemp("templates")) as detector:
+    with TemplateDetector(bracket(), CAMERA, settings, tmp_path_factory.mktemp("templates")) as detector:
         image = photograph(bracket(), truths, CAMERA)
         blind, seeing = detector.detect(image), detector.detect(image, half)
     assert len(seeing) == 2
