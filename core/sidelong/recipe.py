@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Protocol, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from sidelong.detection.refinement_settings import RefinementSettings
+from sidelong.detection.report import DetectionReport
 from sidelong.detection.settings import DetectionSettings
 from sidelong.fusion.settings import FusionSettings
 from sidelong.physics.sensing import SensingSettings
@@ -69,6 +70,11 @@ class Recipe(BaseModel):
 class Detector(Protocol):
     """Finds objects in the projector-off image of the reference view."""
 
+    @property
+    def last_report(self) -> DetectionReport | None:
+        """What the last detection did, and why it found nothing if it did not; None where none was needed."""
+        ...
+
     def detect(self, image: GrayImage, depth_m: FloatArray | None = None) -> tuple[DetectedObject, ...]:
         """Return the objects, none where nothing was found; ``depth_m`` (H, W) was measured from the same place."""
         ...
@@ -83,6 +89,11 @@ class GivenObjects:
     """Stands in for a detector where the poses are known already: detection is left out."""
 
     objects: tuple[DetectedObject, ...]
+
+    @property
+    def last_report(self) -> DetectionReport | None:
+        """None: nothing was detected."""
+        return None
 
     def detect(self, image: GrayImage, depth_m: FloatArray | None = None) -> tuple[DetectedObject, ...]:
         """Return the given objects, whatever the image."""

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from sidelong.detection.refinement import DepthView
+from sidelong.detection.report import DetectionReport, NothingFound
 from sidelong.devices import CaptureRequest, Cell
 from sidelong.errors import DepthError
 from sidelong.fusion.completion import Completion
@@ -56,7 +57,7 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
     completion = Completion(frame, stages.rig.left, recipe.fusion)
     missing_at_first = completion.missing.copy()
 
-    # 1: Line2D, I_o -> {q}
+    # 1: detection, I_o -> {q}; Line2D in the paper
     with stopwatch.stage("detect"):
         objects = stages.detector.detect(image.left, completion.depth_m)
 
@@ -93,7 +94,7 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
         )  # fmt: skip
 
         # 3: G_i of each candidate, equation (13), unless the scan ends here anyway
-        stop, best = _spent(step, recipe.planning), None
+        stop, best = _spent(step, recipe.planning, stages.detector.last_report), None
         if stop is None:
             with stopwatch.stage("score"):
                 if planner is None:
@@ -166,10 +167,11 @@ def _score(cell: Cell, stages: Stages, planner: Planner, taken: list[View], miss
     return (*(planner.score(view, missing) for view in shortlist), *dropped)
 
 
-def _spent(step: Step, settings: PlanningSettings) -> Stop | None:
+def _spent(step: Step, settings: PlanningSettings, detection: DetectionReport | None) -> Stop | None:
     """Say why the scan ends here whatever the candidates promise, if it does."""
     if not step.objects:
-        return Stop.NO_OBJECTS
+        empty = detection is not None and detection.nothing_found is NothingFound.EMPTY_SCENE
+        return Stop.EMPTY_SCENE if empty else Stop.NO_OBJECTS
     if step.recovered_px >= step.missing_px:
         return Stop.NOTHING_MISSING
     return Stop.MAX_VIEWS if step.index >= settings.max_views else None

@@ -35,6 +35,8 @@ class Stop(StrEnum):
     MAX_VIEWS = "max_views"
     NOTHING_MISSING = "nothing_missing"
     NO_OBJECTS = "no_objects"
+    """Something lies there, but nothing that can be told for the part."""
+    EMPTY_SCENE = "empty_scene"
     NO_REACHABLE_VIEW = "no_reachable_view"
 
 

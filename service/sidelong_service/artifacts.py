@@ -7,12 +7,13 @@ import io
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sidelong.detection.report import DetectionReport
 from sidelong.evaluation.reliability import Reliability
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
@@ -46,6 +47,8 @@ class Record:
         The reference step, and the latest.
     reliability
         What was promised of each view beside what it gave.
+    detection
+        What detection did; None where it was left out.
     """
 
     camera: PinholeCamera
@@ -56,6 +59,7 @@ class Record:
     first: Step | None = None
     last: Step | None = None
     reliability: Reliability = field(default_factory=Reliability)
+    detection: DetectionReport | None = None
 
     def add(self, step: Step) -> ViewReport:
         """Take a step in and return its report."""
@@ -177,6 +181,7 @@ def _report(step: Step, record: Record) -> bytes:
         "recovered_px": step.recovered_px,
         "doubtful_px": int(step.doubtful.sum()),
         "setup": record.setup.model_dump(mode="json", exclude={"recipe"}),
+        "detection": None if record.detection is None else _detection(record.detection),
         "views": [view.model_dump(mode="json") for view in record.views],
         "reliability": record.reliability.report().model_dump(mode="json"),
         "recipe": record.setup.recipe,
@@ -190,6 +195,10 @@ def _report(step: Step, record: Record) -> bytes:
         },
     }
     return json.dumps(document, indent=1, allow_nan=False).encode()
+
+
+def _detection(report: DetectionReport) -> dict[str, Any]:
+    return {**asdict(report), "capped": report.capped}
 
 
 def _reference(record: Record) -> Step:

@@ -88,7 +88,7 @@ class ScanProgress(_Bars):
 
 def view_table(views: Sequence[ViewReport]) -> Table:
     """Return the table of a scan: view, gains, completeness, seconds of each stage."""
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = Table(box=SIMPLE_HEAD, padding=(0, 0), pad_edge=False)
     table.add_column("\nview")
     for name in ("expected\ngain px", "measured\ngain px", "\ncomplete", *(f"{stage}\ns" for stage in STAGES)):
         table.add_column(name, justify="right")

@@ -83,7 +83,7 @@ class ScanRun:
             try:
                 self._take_views(replace(self.cell, camera=camera), stages, record)
             finally:
-                record.image = camera.image
+                record.image, record.detection = camera.image, stages.detector.last_report
                 for artifact in write_results(self.folder, record, draw):
                     self.listener.note("artifact", artifact.model_dump())
         if record.last is None or record.last.stop is None:

@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 DistanceM = Annotated[FiniteFloat, Field(ge=0.01, le=20)]
 Pixel = Annotated[int, Field(ge=0, le=100_000)]
+ElevationDeg = Annotated[FiniteFloat, Field(ge=-90, le=90)]
+TurnDeg = Annotated[FiniteFloat, Field(ge=-360, le=360)]
 USUAL_DISTANCE_M = (0.55, 0.95)
 """Of a camera over a bin, where nothing tells."""
 
@@ -26,6 +28,13 @@ class DetectionSettings(BaseModel):
     """Angle between neighbouring views of the viewsphere, in elevation and (on the circle) in azimuth."""
     roll_step_deg: Annotated[FiniteFloat, Field(ge=2, le=60)] = 15.0
     """Angle between neighbouring turns in the image plane."""
+    elevation_deg: tuple[ElevationDeg, ElevationDeg] = (-90.0, 90.0)
+    """From where a part can be seen: elevation of the camera over the xy plane of the part's own frame. Parts that
+    cannot lie on their heads need no templates from below."""
+    azimuth_deg: tuple[TurnDeg, TurnDeg] = (0.0, 360.0)
+    """The same about the part's z axis, from x to y."""
+    roll_deg: tuple[TurnDeg, TurnDeg] = (0.0, 360.0)
+    """Direction in which the part's z axis shows in the image, clockwise from straight up."""
     distance_m: tuple[DistanceM, DistanceM] | None = None
     """Least and largest distance of a part from the camera in the reference view; none: where the cell or the recorded
     depth says, else ``USUAL_DISTANCE_M``."""
@@ -96,6 +105,10 @@ class DetectionSettings(BaseModel):
     def _ordered(self) -> DetectionSettings:
         if not self.reach_m[0] <= self.reach_m[1]:
             raise ValueError(f"distance_m is {self.distance_m}, the first must not exceed the second")
+        for name in ("elevation_deg", "azimuth_deg", "roll_deg"):
+            low, high = getattr(self, name)
+            if not 0 <= high - low <= 360:
+                raise ValueError(f"{name} is {low:g} to {high:g}, must rise by 0 to 360 degrees")
         if self.region_px is not None and not (
             self.region_px[0] < self.region_px[2] and self.region_px[1] < self.region_px[3]
         ):

@@ -21,8 +21,8 @@ from sidelong.geometry.mesh import Part
 FORMAT = 2
 """Raise it when training or the files change."""
 TRAINING_SETTINGS = {
-    "view_step_deg", "roll_step_deg", "distance_m", "distance_ratio", "span_px", "cell_px", "strong_gradient",
-    "dark_cosine", "bright_cosine", "dark_level", "ground_level",
+    "view_step_deg", "roll_step_deg", "elevation_deg", "azimuth_deg", "roll_deg", "distance_m", "distance_ratio",
+    "span_px", "cell_px", "strong_gradient", "dark_cosine", "bright_cosine", "dark_level", "ground_level",
 }  # fmt: skip
 AT_WORK = "training-"
 """Prefix of the folder of a training at work; the id of its process follows."""

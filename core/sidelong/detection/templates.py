@@ -19,7 +19,7 @@ from sidelong.detection.gradient_cells import DIRECTIONS, Float32Array, gradient
 from sidelong.detection.matched_filter import TemplateBank
 from sidelong.detection.settings import DetectionSettings
 from sidelong.detection.shading import brightness
-from sidelong.detection.viewsphere import views
+from sidelong.detection.viewsphere import Ranges, views
 from sidelong.errors import DetectionError
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
@@ -94,11 +94,12 @@ def train(
     Raises
     ------
     DetectionError
-        The part is too small in the image for templates, or larger than the image.
+        The part is too small in the image for templates, or larger than the image; or no view lies in the ranges of
+        elevation, azimuth and roll.
     """
     _check_size(part, camera, settings)
     studio = _Studio(part, matched_focal_px(part, camera, settings), settings)
-    directions = views(settings.view_step_deg, settings.roll_step_deg, part.symmetry)
+    directions = _declared(part, settings)
     jobs = [(direction, rolls, float(d)) for d in distances(settings) for direction, rolls in directions]
     taken: list[tuple[Float32Array, FloatArray]] = [studio.turned(*jobs[0])]
     pool = ThreadPoolExecutor(max_workers=os.cpu_count() or 1)
@@ -171,6 +172,25 @@ class _Studio:
         cosine = -(hits.normals * rays).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
         level = brightness(np.where(hits.instance >= 0, cosine, -1.0), self._settings)
         return (255 * level).astype(np.uint8), object_T_camera[:3, :3].T
+
+
+def _declared(part: Part, settings: DetectionSettings) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the views and turns of the viewsphere that the settings' ranges allow."""
+    ranges = Ranges(settings.elevation_deg, settings.azimuth_deg, settings.roll_deg)
+    step_deg = max(settings.view_step_deg, settings.roll_step_deg)
+    allowed: list[tuple[FloatArray, FloatArray]] = []
+    for direction, rolls in views(settings.view_step_deg, settings.roll_step_deg, part.symmetry):
+        camera_R_object = look_at(direction, np.zeros(3))[:3, :3].T
+        turned = np.array([rotation_about((0, 0, 1), float(roll)) @ camera_R_object for roll in rolls])
+        kept = rolls[ranges.allow(turned, part.symmetry, step_deg)]
+        if len(kept):
+            allowed.append((direction, kept))
+    if not allowed:
+        raise DetectionError(
+            f"{part.name}: no view lies in elevation_deg {settings.elevation_deg}, azimuth_deg {settings.azimuth_deg} "
+            f"and roll_deg {settings.roll_deg}"
+        )
+    return allowed
 
 
 def _window(part: Part, focal_px: float, settings: DetectionSettings) -> BoolArray:

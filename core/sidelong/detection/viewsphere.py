@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from sidelong.geometry.symmetry import Symmetry
 from sidelong.geometry.transforms import look_at
-from sidelong.types import FloatArray
+from sidelong.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +72,46 @@ def views(step_deg: float, roll_step_deg: float, symmetry: Symmetry) -> list[tup
             flat = np.cos(elevation) * np.array([np.cos(azimuth), np.sin(azimuth)])
             found.append((object_R_ring @ (*flat, np.sin(elevation)), rolls))
     return found
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """From where a part can be seen, in degrees and the part's own frame: (low, high) each.
+
+    Attributes
+    ----------
+    elevation_deg
+        Of the camera over the part's xy plane, -90..90.
+    azimuth_deg
+        Of the camera about the part's z axis, from x to y.
+    roll_deg
+        Of the image of the z axis, clockwise from straight up.
+    """
+
+    elevation_deg: tuple[float, float]
+    azimuth_deg: tuple[float, float]
+    roll_deg: tuple[float, float]
+
+    def allow(self, axis_R_object: FloatArray, symmetry: Symmetry, step_deg: float) -> BoolArray:
+        """Say which orientations (N, 3, 3), or one that looks the same, lie in the ranges or within half a step."""
+        equivalent = symmetry.equivalent(np.radians(step_deg))[:, :3, :3]
+        seen = axis_R_object[:, None] @ equivalent
+        x, y, z = np.moveaxis(-seen[..., 2, :], -1, 0)  # from the part to the camera
+        elevation, azimuth = np.degrees(np.arcsin(np.clip(z, -1.0, 1.0))), np.degrees(np.arctan2(y, x))
+        roll = np.degrees(np.arctan2(seen[..., 0, 2], -seen[..., 1, 2]))
+        margin = step_deg / 2
+        low, high = self.elevation_deg
+        high_enough = (elevation >= low - margin) & (elevation <= high + margin)
+        # seen along the axis, azimuth and roll are not apart
+        at_pole = np.abs(elevation) > 90.0 - margin
+        turned = _within(azimuth, self.azimuth_deg, margin) & _within(roll, self.roll_deg, margin)
+        return (high_enough & (at_pole | turned)).any(axis=1)
+
+
+def _within(angle_deg: FloatArray, span_deg: tuple[float, float], margin_deg: float) -> BoolArray:
+    """Say which angles (...) lie in a span, full turns aside."""
+    low, high = span_deg[0] - margin_deg, span_deg[1] + margin_deg
+    return (angle_deg - low) % 360.0 <= high - low
 
 
 def _ring_frame(axis: Axis) -> FloatArray:
