@@ -12,6 +12,8 @@ best 10    of those counted, one of the first ten hypotheses of an object so pla
 top 1      the most probable one is; both modulo the part's symmetry
 correct    ADI of the most probable one is below 10 % of the diameter
 false      objects per scene that lie on no part at all, however hidden
+turn       median angle of the best poses of the correct ones from the truth, degrees; refined: after refinement by the
+           depth of the same view
 match, s   seconds in the matcher, and beside it those of the rest of the detection; median over scenes
 
 With --proposals, what templates and matching alone are worth, for the same parts:
@@ -38,6 +40,8 @@ from sidelong.detection.depth_evidence import DistanceBounds
 from sidelong.detection.detector import TemplateDetector
 from sidelong.detection.matcher_process import MatcherProcess, Matches
 from sidelong.detection.proposals import Starts, poses_on_rays, propose
+from sidelong.detection.refinement import DepthView, Refiner
+from sidelong.detection.refinement_settings import RefinementSettings
 from sidelong.detection.search_region import searched_image
 from sidelong.detection.settings import DetectionSettings
 from sidelong.detection.template_cache import load_or_train
@@ -99,6 +103,11 @@ def photographed(part: Part, ground: str, seed: int, store: Path | None) -> Case
     return Case(image, depth_m, poses, visible)
 
 
+def turn_of(part: Part, item: DetectedObject, pose: np.ndarray) -> float:
+    """Return the angle of an object's best pose from the true one, modulo the symmetry."""
+    return float(part.symmetry.angle_rad(item.hypotheses[0].camera_T_object[:3, :3], pose[:3, :3]))
+
+
 @dataclass
 class Tally:
     """Counts over the scenes of one part on one ground."""
@@ -110,8 +119,12 @@ class Tally:
     correct: int = 0
     false: int = 0
     scenes: int = 0
+    turns_rad: list[float] = field(default_factory=list[float])
+    refined_rad: list[float] = field(default_factory=list[float])
 
-    def add(self, part: Part, case: Case, objects: tuple[DetectedObject, ...]) -> None:
+    def add(
+        self, part: Part, case: Case, objects: tuple[DetectedObject, ...], refined: tuple[DetectedObject, ...]
+    ) -> None:
         """Count one scene."""
         self.scenes += 1
         top = np.array([each.hypotheses[0].camera_T_object for each in objects]).reshape(-1, 4, 4)
@@ -137,7 +150,11 @@ class Tally:
             self.top += any(turn[0] < ANGLE_RAD for turn in turns)
             wanted = KDTree(transform_points(pose, points))
             errors_m = [float(np.mean(wanted.query(transform_points(top[k], points))[0])) for k in mine]
-            self.correct += min(errors_m, default=np.inf) < CORRECT * part.diameter_m
+            if min(errors_m, default=np.inf) < CORRECT * part.diameter_m:
+                self.correct += 1
+                best = mine[int(np.argmin(errors_m))]
+                self.turns_rad.append(turn_of(part, objects[best], pose))
+                self.refined_rad.append(turn_of(part, refined[best], pose))
 
 
 @dataclass
@@ -229,8 +246,14 @@ def row(part: Part, ground: str, tally: Tally, times_s: list[tuple[float, float]
     figures = " ".join(f"{share:7.1f}" for share in shares)
     return (
         f"{part.name:14s} {ground:8s} {tally.counted:7d} {figures} {tally.false / tally.scenes:6.1f} "
+        f"{degrees(tally.turns_rad):5.1f} {degrees(tally.refined_rad):7.1f} "
         f"{match_s:9.2f} {rest_s:6.2f}"
     )
+
+
+def degrees(angles_rad: list[float]) -> float:
+    """Return the median in degrees, NaN of none."""
+    return float(np.degrees(np.median(angles_rad))) if angles_rad else float("nan")
 
 
 def around(cases: list[Case], settings: DetectionSettings) -> DetectionSettings:
@@ -253,7 +276,9 @@ def measured(
             report = detector.last_report
             assert report is not None
             times_s.append((report.match_s, report.align_s))
-            tally.add(part, case, objects)
+            refiner = Refiner(part, rig_for(*SIZE_PX).left, RefinementSettings())
+            refiner.add(DepthView("reference", case.depth_m, np.eye(4)))
+            tally.add(part, case, objects, refiner.refine(objects))
     yield row(part, ground, tally, times_s)
 
 
@@ -276,7 +301,7 @@ def main() -> int:
         head += "templates match 15 match 20 " + " ".join(f"{f'first {n}':>8s}" for n in Stages.FIRST)
         head += " no match   turned     lost   matches capped  match, s"
     else:
-        head += "  found best 10   top 1 correct  false  match, s rest, s"
+        head += "  found best 10   top 1 correct  false  turn refined  match, s rest, s"
     sys.stdout.write(head + "\n")
     for name in options.parts.split(","):
         part = load_part(Path(name)) if Path(name).suffix else simulated_part(name)

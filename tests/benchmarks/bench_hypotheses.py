@@ -1,11 +1,18 @@
 """How well the probabilities of hypotheses tell right poses from wrong ones, on rendered heaps of shiny parts.
 
-    python tests/benchmarks/bench_hypotheses.py [--parts tube_fitting,gear,part.stl] [--grounds matte,printed]
-                                                [--seeds 0,1] [--learn] [--store DIR]
+    python tests/benchmarks/bench_hypotheses.py [--parts tube_fitting,gear,part.stl] [--seeds 0,1] [--learn]
+                                                [--scenes matte,printed,other,empty,drawn] [--store DIR]
 
 No templates: poses are started from the truth, disturbed by up to half a step between templates; from wrong turns of
 the parts that are there; and from the most promising of many random poses anywhere. All are aligned and labelled: right
-within 15 degrees modulo symmetry and a quarter of the diameter. With depth and without, for each part and ground:
+within 15 degrees modulo symmetry and a quarter of the diameter.
+
+matte, printed   heaps of the part on plain and on strongly textured ground
+other            a heap of another part: no pose is right here, nor in the next two
+empty            an empty bin, its ground plain and textured in turn
+drawn            a flat mosaic of steps, stripes, discs, rings, chequers, ramps and blurred noise of the part's size
+
+With depth and without, for each part and scene:
 
 right      share of the parts at least 60 % visible for which a disturbed pose is right after alignment
 P right    median probability of the best right pose of each of these parts, and its lowest tenth
@@ -13,8 +20,9 @@ P false    probability that one in a hundred of the poses exceeds which lie on n
 log-lik    mean log-likelihood of the right hypothesis among an object's, at the temperature of the settings
 ECE        expected calibration error of these probabilities
 
-``--learn`` fits the coefficients to all parts, and to all but one, prints those of ``plausibility``, the loss on the
-part that was left out, and the temperature that maximises its log-likelihood.
+``--learn`` fits the coefficients to all parts, and to all but one, prints those of ``plausibility``, the loss and the
+calibration error of single poses on the part that was left out, beside those of the shipped coefficients, and the
+temperature that maximises its log-likelihood.
 """
 
 from __future__ import annotations
@@ -26,7 +34,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from bench_detection import ANGLE_RAD, NEAR, SIZE_PX, VISIBLE, Case, photographed
+from bench_detection import (
+    ANGLE_RAD,
+    BASE_T_BIN,
+    BIN,
+    DEPTH_EXPOSURE_S,
+    IMAGE_EXPOSURE_S,
+    NEAR,
+    PARTS_PER_BIN,
+    SIZE_PX,
+    VISIBLE,
+    Case,
+    photographed,
+)
+from scipy import ndimage
 from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
 
@@ -38,10 +59,16 @@ from sidelong.detection.settings import DetectionSettings
 from sidelong.detection.verification import Evidence, Verifier
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part, load_part
-from sidelong.simulation.parts import simulated_part
+from sidelong.geometry.transforms import invert
+from sidelong.planning.candidates import DomeSettings, dome_views
+from sidelong.simulation.heap import heap
+from sidelong.simulation.parts import PART_NAMES, simulated_part
 from sidelong.simulation.rig import rig_for
+from sidelong.simulation.sensor import ActiveStereoSensor, SensorSettings
+from sidelong.types import Projector
 
-DISTURBED, TURNED, ANYWHERE, PROMISING = 4, 5, 3000, 300
+DISTURBED, TURNED, ANYWHERE, PROMISING = 4, 5, 1200, 120
+HEAPS = ("matte", "printed")
 HALF_STEP_RAD, HALF_STEP_RATIO, HALF_STEP_PX = np.radians(10.0), 0.04, 4.0
 DISTANCE_RANGE = 1.1
 RIDGE = 1e-3
@@ -54,8 +81,8 @@ class Sample:
 
     Attributes
     ----------
-    part, ground, visible
-        What is seen, and how much (N,) of each part.
+    part, scene, visible
+        What is looked for in what, and how much (N,) of each part is visible.
     poses
         (K, 4, 4).
     features
@@ -67,7 +94,7 @@ class Sample:
     """
 
     part: Part
-    ground: str
+    scene: str
     visible: np.ndarray
     poses: np.ndarray
     features: Mapping[str, np.ndarray]
@@ -75,22 +102,90 @@ class Sample:
     right: np.ndarray
 
 
-def sampled(part: Part, ground: str, case: Case, verifier: Verifier, depth: bool) -> Sample:
+def case_of(part: Part, scene: str, seed: int, store: Path | None) -> Case:
+    """Render a scene, or read it from the store. Where the part is not, the poses say where to look for it."""
+    if scene in HEAPS:
+        return photographed(part, scene, seed, store)
+    ground = HEAPS[seed % 2]
+    if scene == "other":
+        known = [name for name in PART_NAMES if name != part.name]
+        return photographed(simulated_part(known[seed % len(known)]), ground, seed, store)
+    view = dome_views((0.5, 0.0, 0.03), DomeSettings())
+    base_T_camera = view[seed % len(view)].base_T_camera
+    poses = invert(base_T_camera) @ np.array(heap(part, PARTS_PER_BIN, seed, BASE_T_BIN, BIN))
+    if scene == "empty":
+        image, depth_m = _empty_bin(ground, seed, base_T_camera, store)
+    else:
+        distance_m = poses[:, 2, 3]
+        image = _mosaic(rig_for(*SIZE_PX).left.fx * part.diameter_m / distance_m.mean(), seed)
+        depth_m = distance_m.max()
+    return Case(image, np.broadcast_to(depth_m, image.shape), poses, np.zeros(len(poses)))
+
+
+def _empty_bin(ground: str, seed: int, base_T_camera: np.ndarray, store: Path | None) -> tuple[np.ndarray, np.ndarray]:
+    path = None if store is None else store / f"empty_{ground}_{seed}.npz"
+    if path is not None and path.is_file():
+        with np.load(path) as kept:
+            return kept["image"], kept["depth_m"]
+    box = BIN.model_copy(update={"material": ground})
+    sensor = ActiveStereoSensor(rig_for(*SIZE_PX), [(box.part(), BASE_T_BIN)], SensorSettings())
+    image = sensor.capture(base_T_camera, Projector.OFF, IMAGE_EXPOSURE_S, depth=False).left
+    depth_m = sensor.capture(base_T_camera, Projector.DOTS, DEPTH_EXPOSURE_S, depth=True).depth_m
+    assert depth_m is not None
+    if path is not None:
+        np.savez_compressed(path, image=image, depth_m=depth_m)
+    return image, depth_m
+
+
+def _mosaic(diameter_px: float, seed: int) -> np.ndarray:
+    """Return an image of plain patterns, each on a tile of twice the part's diameter, in camera noise."""
+    rng = np.random.default_rng(seed)
+    size = int(2 * diameter_px)
+    v, u = (np.indices((size, size)) - size / 2) / diameter_px
+    image = np.zeros((SIZE_PX[1], SIZE_PX[0]))
+    for top in range(0, image.shape[0], size):
+        for left in range(0, image.shape[1], size):
+            angle, width, dark, bright = rng.uniform((0, 0.15, 10, 90), (np.pi, 0.6, 60, 220))
+            across = u * np.cos(angle) + v * np.sin(angle)
+            along = v * np.cos(angle) - u * np.sin(angle)
+            radius = np.hypot(u, v)
+            noise = ndimage.gaussian_filter(rng.normal(size=u.shape), width * diameter_px / 8)
+            share = (
+                across > 0,
+                np.abs(across) < width / 2,
+                (np.abs(across) < width / 2) & (np.abs(along) < 0.5),
+                radius < width,
+                np.abs(radius - 0.4) < width / 4,
+                np.floor(across / width) % 2 == np.floor(along / width) % 2,
+                across % 1.0,
+                0.5 + 0.25 * noise / noise.std(),
+            )[rng.integers(8)]
+            tile = image[top : top + size, left : left + size]
+            tile[:] = (dark + (bright - dark) * np.asarray(share, float))[: tile.shape[0], : tile.shape[1]]
+    smooth = ndimage.gaussian_filter(np.clip(image, 0, 255), 0.7)
+    return np.clip(rng.poisson(smooth * 8) / 8, 0, 255).astype(np.uint8)
+
+
+def sampled(part: Part, scene: str, case: Case, verifier: Verifier, depth: bool) -> Sample:
     """Align poses around the truth and anywhere, and label them."""
     camera, rng = rig_for(*SIZE_PX).left, np.random.default_rng(0)
     evidence = Evidence(case.image, case.depth_m if depth else None)
-    around = np.concatenate([_around(part, camera, pose, rng) for pose in case.camera_T_objects[case.visible > 0.3]])
-    starts = verifier.glance(_bounded(part, around), evidence)[0]
+    truths = case.camera_T_objects if scene in HEAPS else np.zeros((0, 4, 4))
+    around = [_around(part, camera, pose, rng) for pose in truths[case.visible[: len(truths)] > 0.3]]
+    starts = verifier.glance(_bounded(part, np.concatenate([np.zeros((0, 4, 4)), *around])), evidence)[0]
     anywhere, promise = verifier.glance(_bounded(part, _anywhere(part, camera, case, rng)), evidence)
     starts = Starts.joined([starts, anywhere[np.argsort(-promise)[:PROMISING]]])
     found = [verifier.aligned(starts[np.arange(k, min(k + 48, len(starts.poses)))], evidence)
              for k in range(0, len(starts.poses), 48)]  # fmt: skip
     poses = np.concatenate([each[0] for each in found])
     features = {name: np.concatenate([each[2][name] for each in found]) for name in found[0][2]}
-    apart, turn_rad = _errors(part, poses, case.camera_T_objects)
+    if scene not in HEAPS:
+        nothing = np.zeros(len(poses), dtype=bool)
+        return Sample(part, scene, np.zeros(0), poses, features, np.full(len(poses), -1), nothing)
+    apart, turn_rad = _errors(part, poses, truths)
     owner = np.where(apart.min(axis=1) < NEAR, apart.argmin(axis=1), -1)
     right = (owner >= 0) & (np.take_along_axis(turn_rad, owner[:, None].clip(0), 1)[:, 0] < ANGLE_RAD)
-    return Sample(part, ground, case.visible, poses, features, owner, right)
+    return Sample(part, scene, case.visible, poses, features, owner, right)
 
 
 def _around(part: Part, camera: PinholeCamera, pose: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -140,10 +235,13 @@ def log_odds_of(model: Mapping[str, float], features: Mapping[str, np.ndarray]) 
 
 
 def fitted(samples: Sequence[Sample], names: Sequence[str]) -> dict[str, float]:
-    """Return the logistic model that fits best; scenes count alike, right and wrong poses as they come."""
+    """Return the logistic model that fits best. Right and wrong poses count as they come, scenes of a kind alike, and
+    those with the part as much as those without."""
     design = np.concatenate([np.stack([np.ones(len(s.right)), *(s.features[n] for n in names)], -1) for s in samples])
     right = np.concatenate([s.right for s in samples]).astype(float)
-    weight = np.concatenate([np.full(len(s.right), 1 / len(s.right) / len(samples)) for s in samples])
+    kinds = [s.scene in HEAPS for s in samples]
+    share = [1 / kinds.count(kind) / len(set(kinds)) for kind in kinds]
+    weight = np.concatenate([np.full(len(s.right), w / len(s.right)) for s, w in zip(samples, share, strict=True)])
 
     def loss(model: np.ndarray) -> tuple[float, np.ndarray]:
         odds = design @ model
@@ -182,9 +280,12 @@ def calibration_error(groups: list[tuple[np.ndarray, np.ndarray]], temperature: 
         return np.nan
     share = np.concatenate([softmax(odds, temperature) for odds, _ in groups])
     right = np.concatenate([right for _, right in groups])
-    bins = np.minimum((share * BINS).astype(int), BINS - 1)
-    off = [abs(float((right[bins == k] - share[bins == k]).sum())) for k in range(BINS)]
-    return sum(off) / len(share)
+    return _off_calibration(share, right, np.full(len(share), 1 / len(share)))
+
+
+def _off_calibration(chance: np.ndarray, right: np.ndarray, weight: np.ndarray) -> float:
+    bins = np.minimum((chance * BINS).astype(int), BINS - 1)
+    return float(np.abs(np.bincount(bins, weight * (right - chance), BINS)).sum())
 
 
 def row(samples: Sequence[Sample], model: Mapping[str, float], depth: bool) -> str:
@@ -204,31 +305,43 @@ def row(samples: Sequence[Sample], model: Mapping[str, float], depth: bool) -> s
     lowest, middle = np.quantile(best, [0.1, 0.5]) if best else (np.nan, np.nan)
     temperature = DetectionSettings().temperature
     return (
-        f"{samples[0].part.name:14s} {samples[0].ground:8s} {'yes' if depth else 'no':5s} {counted:6d} "
+        f"{samples[0].part.name:14s} {samples[0].scene:8s} {'yes' if depth else 'no':5s} {counted:6d} "
         f"{100 * len(best) / max(counted, 1):6.1f} {middle:7.3f} {lowest:7.3f} "
         f"{np.quantile(np.concatenate(false), 0.99):8.3f} {log_likelihood(groups, temperature):8.3f} "
         f"{calibration_error(groups, temperature):6.3f}"
     )
 
 
-def learned(samples: Sequence[Sample], names: Sequence[str]) -> list[str]:
-    """Return lines: coefficients, loss on each part that was left out, temperature and what it changes."""
+def learned(samples: Sequence[Sample], shipped: Mapping[str, float]) -> list[str]:
+    """Return lines: coefficients, what they are worth on each part that was left out, what temperature changes."""
+    names = [name for name in shipped if name != AT_ZERO]
     lines = ["  ".join(f"{name} {weight:.2f}" for name, weight in fitted(samples, names).items())]
     groups: list[tuple[np.ndarray, np.ndarray]] = []
     for part in dict.fromkeys(s.part.name for s in samples):
         model = fitted([s for s in samples if s.part.name != part], names)
         out = [s for s in samples if s.part.name == part]
-        odds = [log_odds_of(model, s.features) for s in out]
-        loss = np.mean([np.mean(np.logaddexp(0, o) - s.right * o) for o, s in zip(odds, out, strict=True)])
         even = np.mean([_entropy(float(s.right.mean())) for s in out])
-        lines.append(f"left out {part}: loss {loss:.3f}, of a constant {even:.3f}")
-        groups += [group for o, s in zip(odds, out, strict=True) for group in objects_of(s, o)]
+        (loss, off), (loss_shipped, off_shipped) = (_of_poses(out, each) for each in (model, shipped))
+        lines.append(
+            f"left out {part}: loss {loss:.3f}, of a constant {even:.3f}, shipped {loss_shipped:.3f}; "
+            f"ECE {off:.3f}, shipped {off_shipped:.3f}"
+        )
+        groups += [group for s in out for group in objects_of(s, log_odds_of(model, s.features))]
     best = float(minimize_scalar(lambda t: -log_likelihood(groups, t), bounds=(0.05, 5.0), method="bounded").x)
     lines += [
         f"temperature {t:.2f}: log-likelihood {log_likelihood(groups, t):.3f}, ECE {calibration_error(groups, t):.3f}"
-        for t in (1.0, best)
+        for t in (1.0, DetectionSettings().temperature, best)
     ]
     return lines
+
+
+def _of_poses(samples: Sequence[Sample], model: Mapping[str, float]) -> tuple[float, float]:
+    """Return the mean loss and the expected calibration error of single poses; scenes count alike."""
+    odds = [log_odds_of(model, s.features) for s in samples]
+    loss = np.mean([np.mean(np.logaddexp(0, o) - s.right * o) for o, s in zip(odds, samples, strict=True)])
+    chance, right = probability(np.concatenate(odds)), np.concatenate([s.right for s in samples])
+    weight = np.concatenate([np.full(len(s.right), 1 / len(s.right) / len(samples)) for s in samples])
+    return float(loss), _off_calibration(chance, right, weight)
 
 
 def _entropy(share: float) -> float:
@@ -239,27 +352,26 @@ def main() -> int:
     """Print the table, or what was learned."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", default="tube_fitting,hex_screw,eye_bolt,gear", help="simulated parts or CAD files")
-    parser.add_argument("--grounds", default="matte,printed")
+    parser.add_argument("--scenes", default="matte,printed,other,empty,drawn")
     parser.add_argument("--seeds", default="0,1")
     parser.add_argument("--learn", action="store_true", help="fit the model anew, one part left out at a time")
     parser.add_argument("--store", type=Path, default=None, help="keep rendered scenes here")
     options = parser.parse_args()
     seen: dict[bool, list[Sample]] = {True: [], False: []}
     models = {True: WITH_DEPTH, False: WITHOUT_DEPTH}
-    sys.stdout.write("part           ground   depth  parts  right P right  lowest  P false  log-lik    ECE\n")
+    sys.stdout.write("part           scene    depth  parts  right P right  lowest  P false  log-lik    ECE\n")
     for name in options.parts.split(","):
         part = load_part(Path(name)) if Path(name).suffix else simulated_part(name)
         verifier = Verifier(part, rig_for(*SIZE_PX).left, DetectionSettings())
-        for ground in options.grounds.split(","):
-            cases = [photographed(part, ground, int(seed), options.store) for seed in options.seeds.split(",")]
+        for scene in options.scenes.split(","):
+            cases = [case_of(part, scene, int(seed), options.store) for seed in options.seeds.split(",")]
             for depth in (True, False):
-                samples = [sampled(part, ground, case, verifier, depth) for case in cases]
+                samples = [sampled(part, scene, case, verifier, depth) for case in cases]
                 seen[depth] += samples
                 sys.stdout.write(row(samples, models[depth], depth) + "\n")
                 sys.stdout.flush()
     for depth, samples in seen.items() if options.learn else ():
-        names = [name for name in models[depth] if name != AT_ZERO]
-        sys.stdout.write("\n".join([f"\n{'with' if depth else 'without'} depth", *learned(samples, names), ""]))
+        sys.stdout.write("\n".join([f"\n{'with' if depth else 'without'} depth", *learned(samples, models[depth]), ""]))
     return 0
 
 

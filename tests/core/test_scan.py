@@ -13,6 +13,7 @@ import pytest
 
 from sidelong.detection.refinement import Refiner
 from sidelong.detection.refinement_settings import RefinementSettings
+from sidelong.detection.settings import DetectionSettings
 from sidelong.devices import Cell
 from sidelong.errors import DepthError, DeviceTimeoutError, DeviceUnavailableError
 from sidelong.geometry.transforms import invert, rotation_about, transform
@@ -176,6 +177,14 @@ def test_views_are_where_the_arm_says_it_is(world: World, steps: list[Step]) -> 
 def test_without_objects_there_is_nothing_to_plan(world: World) -> None:
     (only,) = steps_of(world, objects=())
     assert (only.stop, only.missing_px, only.completeness) == (Stop.NO_OBJECTS, 0, 1.0)
+
+
+def test_an_empty_bin_ends_the_scan_as_such(tmp_path: Path) -> None:
+    recipe = Recipe(detection=DetectionSettings(view_step_deg=40, roll_step_deg=30, distance_m=(0.65, 0.75)))
+    for empty in world_of(SimulatedCameraSettings(width=320, height=256, count=0)):
+        with build_stages(recipe, empty.camera.part, empty.camera.rig, tmp_path) as stages:
+            (only,) = scan(empty.cell, stages, recipe, Stopwatch())
+    assert (only.stop, only.objects, only.missing_px) == (Stop.EMPTY_SCENE, (), 0)
 
 
 def test_where_nothing_is_missing_nothing_moves(world: World) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sidelong.errors import SettingsError
-from sidelong.geometry.symmetry import Symmetry, no_symmetry
+from sidelong.geometry.symmetry import Symmetry
 from sidelong.types import FloatArray, IntArray
 
 
@@ -58,14 +58,18 @@ def distinct(
     ``step_rad`` and the distances differ by a ratio below ``1 + step_rad``: both move the contour of a part by about
     the same.
     """
-    symmetry = symmetry or no_symmetry(np.zeros(3))
     left = np.arange(len(rotations))
+    flat = rotations.reshape(len(rotations), 9)
     kept: list[int] = []
     while len(left) and len(kept) < limit:
-        kept.append(int(left[0]))
-        turn_rad = symmetry.angle_rad(rotations[left], rotations[left[0]])
-        ratio = np.abs(np.log(distances_m[left] / distances_m[left[0]]))
-        alike = (turn_rad < step_rad) & (ratio < step_rad)
+        first = int(left[0])
+        kept.append(first)
+        if symmetry is None:
+            # the trace of A' B is 1 + 2 cos of the turn between them, and the sum of the products of their elements
+            near = flat[left] @ flat[first] > 1.0 + 2.0 * np.cos(step_rad)
+        else:
+            near = symmetry.angle_rad(rotations[left], rotations[first]) < step_rad
+        alike = near & (np.abs(np.log(distances_m[left] / distances_m[first])) < step_rad)
         alike[0] = True
         left = left[~alike]
     return np.array(kept, dtype=np.intp)

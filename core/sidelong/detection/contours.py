@@ -6,7 +6,6 @@ Contours are points on edges of the mesh where brightness is expected to step: s
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part, simplified
 from sidelong.geometry.raycast import RayScene
 from sidelong.geometry.transforms import invert
-from sidelong.types import BoolArray, FloatArray, GrayImage, IntArray
+from sidelong.types import BoolArray, FloatArray, GrayImage, IntArray, RealArray
 
 MAX_TRIANGLES = 2500
 LIFT = 0.004
@@ -30,19 +29,26 @@ LEAST_STEP = 0.1
 class ContourPoints:
     """Points and tangents (K, P, 3) in the object frame, which are visible and which on the silhouette (K, P)."""
 
-    points: FloatArray
-    tangents: FloatArray
+    points: NDArray[np.float32]
+    tangents: NDArray[np.float32]
     visible: BoolArray
     silhouette: BoolArray
+
+    def __getitem__(self, view: IntArray) -> ContourPoints:
+        return ContourPoints(self.points[view], self.tangents[view], self.visible[view], self.silhouette[view])
 
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """Points (K, P, 3) in the camera frame, their pixels (K, P, 2) and the contour's normals there (K, P, 2)."""
+    """Points (3, K, P) in the camera frame, their pixels (2, K, P) and the contour's normals there (2, K, P)."""
 
-    points_camera: FloatArray
-    uv: FloatArray
-    normals: FloatArray
+    points_camera: NDArray[np.float32]
+    uv: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+    def beside(self, along_px: RealArray) -> NDArray[np.float32]:
+        """Return the pixels (2, K, P, S) that lie so far (K, 1, S) along the normals."""
+        return np.asarray(self.uv[..., None] + self.normals[..., None] * along_px.astype(np.float32), dtype=np.float32)
 
 
 class EdgeField:
@@ -60,14 +66,15 @@ class EdgeField:
         self._field = gradient / (strength + noise)
         self.strength: NDArray[np.float32] = (strength / (strength + noise))[..., 0]
 
-    def agreement(self, uv: FloatArray, normals: FloatArray) -> FloatArray:
-        """Return |gradient . normal| (K, ...) at pixels (K, ..., 2); 0 outside the image."""
+    def agreement(self, uv: NDArray[np.float32], normals: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return |gradient . normal| (K, ...) at pixels (2, K, ...) with normals (2, K, ...); 0 outside the image."""
         import cv2
 
-        remap: Any = cv2.remap  # its stub forbids the None that means: coordinates are in one array
-        where = uv.reshape(len(uv), -1, 2).astype(np.float32)
-        sampled = remap(self._field, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        return np.abs((sampled.reshape(uv.shape).astype(np.float64) * normals).sum(axis=-1))
+        u, v = uv.reshape(2, uv.shape[1], -1)
+        sampled = cv2.remap(self._field, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        sampled = sampled.reshape(*uv.shape[1:], 2)
+        response = np.abs(sampled[..., 0] * normals[0] + sampled[..., 1] * normals[1])
+        return np.asarray(response, dtype=np.float32)
 
 
 class ContourModel:
@@ -75,38 +82,45 @@ class ContourModel:
 
     def __init__(self, part: Part, settings: DetectionSettings) -> None:
         self._settings = settings
-        self._diameter_m = part.diameter_m
         coarse = simplified(part, MAX_TRIANGLES)
         self._scene = RayScene([(coarse, np.eye(4))])
         corners = coarse.vertices_m[coarse.triangles]
         self._normals = coarse.triangle_normals.astype(np.float32)
         self._middles = corners.mean(axis=1).astype(np.float32)
         edges, self._faces = _shared_edges(coarse)
-        self._start = coarse.vertices_m[edges[:, 0]]
-        self._tangents = coarse.vertices_m[edges[:, 1]] - self._start
-        self._length = np.linalg.norm(self._tangents, axis=1).astype(np.float32)
-        self._outward = coarse.triangle_normals[self._faces].sum(axis=1)
+        start, end = coarse.vertices_m[edges[:, 0]], coarse.vertices_m[edges[:, 1]]
+        self._start, self._tangents = start.astype(np.float32), (end - start).astype(np.float32)
+        self._length = np.linalg.norm(self._tangents, axis=1)
+        self._lift_m = (LIFT * part.diameter_m * coarse.triangle_normals[self._faces].sum(axis=1)).astype(np.float32)
 
     def select(self, camera_T_object: FloatArray, rng: np.random.Generator) -> ContourPoints:
         """Draw ``contour_points`` for each pose (K, 4, 4), in proportion to length times expected contrast."""
         eye = invert(camera_T_object)[:, :3, 3]
         cosine = self._cosines(eye.astype(np.float32))
-        level = brightness(cosine, self._settings).astype(np.float32)
-        contrast = np.abs(level[:, self._faces[:, 0]] - level[:, self._faces[:, 1]])
-        contrast[contrast < LEAST_STEP] = 0.0
-        share = np.cumsum(self._length * contrast, axis=1, dtype=np.float64)
+        weight = self._length * self._contrast(cosine)
+        share = np.cumsum(weight, axis=1, dtype=np.float64)
         count = self._settings.contour_points
         drawn = (np.arange(count) + rng.random((len(eye), 1))) / count * share[:, -1:]
-        chosen = np.stack([np.searchsorted(*each) for each in zip(share, drawn, strict=True)])
+        chosen = np.empty(drawn.shape, dtype=np.intp)
+        for row, (upto, wanted) in enumerate(zip(share, drawn, strict=True)):
+            chosen[row] = np.searchsorted(upto, wanted)
         chosen = np.minimum(chosen, len(self._length) - 1)
-        upto, rows = np.take_along_axis(share, chosen, axis=1), np.arange(len(eye))[:, None]
-        weight = (self._length[chosen] * contrast[rows, chosen]).astype(np.float64)
-        along = np.clip(1.0 - (upto - drawn) / np.maximum(weight, 1e-12), 0.0, 1.0)
-        points = self._start[chosen] + self._tangents[chosen] * along[..., None]
-        hidden = self._scene.blocked(points + LIFT * self._diameter_m * self._outward[chosen], eye[:, None])
-        away = cosine[rows[..., None], self._faces[chosen]] <= 0
-        silhouette: BoolArray = away.any(axis=-1)
-        return ContourPoints(points, self._tangents[chosen], ~hidden & (weight > 0), silhouette)
+        rows = np.arange(len(eye))[:, None]
+        weight = weight[rows, chosen].astype(np.float64)
+        along = np.clip(1.0 - (share[rows, chosen] - drawn) / np.maximum(weight, 1e-12), 0.0, 1.0)
+        tangents = self._tangents[chosen]
+        points = self._start[chosen] + tangents * along[..., None].astype(np.float32)
+        hidden = self._scene.blocked(points + self._lift_m[chosen], eye[:, None])
+        one, other = np.moveaxis(self._faces[chosen], -1, 0)
+        silhouette = np.minimum(cosine[rows, one], cosine[rows, other]) <= 0
+        return ContourPoints(points, tangents, ~hidden & (weight > 0), silhouette)
+
+    def _contrast(self, cosine: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return how much the two faces of each edge are expected to differ, (K, E)."""
+        level = brightness(cosine, self._settings)
+        contrast = np.abs(np.take(level, self._faces[:, 0], axis=1) - np.take(level, self._faces[:, 1], axis=1))
+        contrast[contrast < LEAST_STEP] = 0.0
+        return contrast
 
     def _cosines(self, eye: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the cosines (K, F) between the faces' normals and the directions to the viewer at (K, 3)."""
@@ -117,17 +131,19 @@ class ContourModel:
 
 
 def project(contour: ContourPoints, camera: PinholeCamera, camera_T_object: FloatArray) -> Projected:
-    """Project contour points by poses (K, 4, 4)."""
-    rotation = np.swapaxes(camera_T_object[:, :3, :3], 1, 2)
-    points = contour.points @ rotation + camera_T_object[:, None, :3, 3]
-    tangents = contour.tangents @ rotation
-    x, y, z = np.moveaxis(points, -1, 0)
+    """Project contour points by poses (K, 4, 4); the pixels of points not in front are NaN."""
+    rotation = camera_T_object[:, :3, :3].astype(np.float32)
+    shift = camera_T_object[:, :3, 3].T[..., None].astype(np.float32)
+    points = np.moveaxis(rotation @ np.swapaxes(contour.points, 1, 2), 1, 0) + shift
+    tangents = np.moveaxis(rotation @ np.swapaxes(contour.tangents, 1, 2), 1, 0)
+    x, y, z = points
+    ahead = np.where(z > 0, z, np.float32(np.nan))
+    uv = np.stack([camera.fx * (x / ahead) + camera.cx, camera.fy * (y / ahead) + camera.cy])
     # derivative of the projection along the tangent, times z squared
-    along_u = camera.fx * (tangents[..., 0] * z - x * tangents[..., 2])
-    along_v = camera.fy * (tangents[..., 1] * z - y * tangents[..., 2])
-    normals = np.stack([-along_v, along_u], axis=-1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    return Projected(points, camera.project(points), normals)
+    along_u = camera.fx * (tangents[0] * z - x * tangents[2])
+    along_v = camera.fy * (tangents[1] * z - y * tangents[2])
+    normals = np.stack([-along_v, along_u]) / np.maximum(np.hypot(along_u, along_v), np.float32(1e-12))
+    return Projected(points, uv, normals)
 
 
 def _shared_edges(part: Part) -> tuple[IntArray, IntArray]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sidelong.detection.appearance import Look
 from sidelong.errors import SettingsError
-from sidelong.types import BoolArray, FloatArray
+from sidelong.types import BoolArray, FloatArray, RealArray
 
 SAMPLES = 7
 """Depths looked at across a part, in both directions."""
@@ -75,10 +75,10 @@ def residuals(look: Look, depth_m: FloatArray) -> FloatArray:
     return sampled(depth_m, look.uv) - look.depth_m
 
 
-def offsets(residual_m: FloatArray, covered: BoolArray, reach_m: float) -> FloatArray:
+def offsets(residual_m: FloatArray, covered: BoolArray, reach_m: float | FloatArray) -> FloatArray:
     """Return how much further away (K,) parts are than expected: the median of residuals (K, Q) within reach.
 
-    0 where too little of a part was measured to say.
+    The reach is one for all, or (K, 1). 0 where too little of a part was measured to say.
     """
     near = np.abs(residual_m) <= reach_m  # False for NaN
     enough = near.sum(axis=1) >= np.maximum(LEAST_SHARE * covered.sum(axis=1), FEWEST)
@@ -87,14 +87,14 @@ def offsets(residual_m: FloatArray, covered: BoolArray, reach_m: float) -> Float
     return np.where(enough, middle, 0.0)
 
 
-def sampled(depth_m: FloatArray, uv: FloatArray) -> FloatArray:
+def sampled(depth_m: FloatArray, uv: RealArray) -> FloatArray:
     """Return the depth (...) at the nearest pixel centres to pixels (..., 2); NaN outside the image."""
     height, width = depth_m.shape
+    column, row = np.rint(uv[..., 0]), np.rint(uv[..., 1])
     # a part at the camera projects to anywhere, also to where no integer is
-    anywhere = np.nan_to_num(np.moveaxis(uv, -1, 0), nan=-1.0)
-    column, row = np.rint(np.clip(anywhere, -1.0, max(height, width))).astype(np.intp)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return np.where(inside, depth_m[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)], np.nan)
+    at = np.where(inside, row, 0).astype(np.intp) * width + np.where(inside, column, 0).astype(np.intp)
+    return np.where(inside, depth_m.reshape(-1)[at], np.nan)
 
 
 def _inner_range(depth_m: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -28,9 +28,11 @@ from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
 from sidelong.types import BoolArray, DetectedObject, FloatArray, GrayImage, IntArray
 
-FIRST_POSES, MORE_POSES = 4, 14
+PROMISING_PER_OBJECT = 2
+"""Clusters that are aligned, most promising first: so many more than objects."""
+FIRST_POSES, MORE_POSES = 3, 18
 """Of a cluster; only where one of the first may be right are more looked at."""
-HOPEFUL = 0.1
+HOPEFUL = 0.3
 """Share of ``min_score`` that one of the first poses needs."""
 
 
@@ -151,6 +153,8 @@ class TemplateDetector:
         starts, promise = models.verifier.glance(Starts.joined(clusters), evidence)
         ends = np.cumsum([0, *(len(each.poses) for each in clusters)]).tolist()
         ranked = [first + np.argsort(-promise[first:last], kind="stable") for first, last in pairwise(ends)]
+        ranked.sort(key=lambda order: -promise[order[0]])
+        ranked = ranked[: PROMISING_PER_OBJECT * self._settings.max_objects]
         firsts = [order[:FIRST_POSES] for order in ranked]
         found = models.verifier.verify(starts[_joined(firsts)], evidence)
         owner = np.repeat(np.arange(len(firsts)), [len(order) for order in firsts])

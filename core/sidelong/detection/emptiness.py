@@ -34,8 +34,8 @@ def is_empty(
 
     With depth: all that was measured lies on pieces of planes longer than the part (floor, table, walls of a bin), but
     for seams narrower than ``BLOB`` samples. A part of which nothing was measured, or thinner than ``FLAT`` of its
-    diameter, is not noticed. Without depth only an image without edges is an empty scene: grey values do not tell an
-    empty bin from a full one.
+    diameter, is not noticed: an empty bin has holes as wide, with as many edges, in the shadows of its walls. Without
+    depth only an image without edges is an empty scene: grey values do not tell an empty bin from a full one.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""From verified poses to objects: which are about the same object, which of them to keep, and how much of it is seen."""
+"""From verified poses to objects: which are about the same object, which of them to keep, how much of it is seen."""
 
 from __future__ import annotations
 
@@ -19,9 +19,16 @@ CELL = 0.05
 """Size of the cells on which silhouettes are compared, in diameters of the part."""
 OVERLAP_COST = 4.0
 """Log-odds that a silhouette loses which a better object covers: the edges and grey values there are that object's."""
+LIKE_DEPTH = 0.2
+"""Surfaces of known depth that differ by more are two, in diameters: of parts that lie across each other both exist."""
+KNOWN = 0.3
+"""Share of what was measured on a pose that must lie on its surface for its depth to be known."""
 COARSE_TRIANGLES = 1000
 IN_FRONT = 0.02
 """How far before an object another surface must lie to hide it, in diameters: meshes and poses are not exact."""
+
+Cells = dict[tuple[int, int], float]
+"""Depth by cell of the image, metres."""
 
 
 class ObjectBuilder:
@@ -39,22 +46,26 @@ class ObjectBuilder:
         """Return which of K poses are objects, best first.
 
         Taken first is what probably explains most pixels: edges and grey values of a part make slivers of it probable
-        too. Poses at the place of one that was taken are none; what a pose has in common with the silhouette of another
-        speaks less for it.
+        too. Poses at the place of one that was taken are none; what a pose has in common with another speaks less for
+        it.
         """
         settings, uv, reach_px = self._settings, *self._places(found)
         cell_px = max(2.0, CELL / SAME_PLACE * float(reach_px.min(initial=np.inf)))
         seeds: list[int] = []
-        taken: list[set[tuple[int, int]]] = []
+        taken: list[Cells] = []
         probable = probability(found.log_odds) >= settings.min_score / 100
         explained = probability(found.log_odds) * np.array([len(surface) for surface in found.silhouettes])
-        for k in np.argsort(-explained, kind="stable").tolist():
+        order: list[int] = np.argsort(-explained, kind="stable").tolist()
+        for k in order:
             if len(seeds) == settings.max_objects:
                 break
             if not probable[k] or (np.linalg.norm(uv[seeds] - uv[k], axis=1) <= reach_px[seeds]).any():
                 continue
-            cells = {(int(u), int(v)) for u, v in np.floor(found.silhouettes[k][:, :2] / cell_px)}
-            overlap = max((shared(cells, other) for other in taken), default=0.0) if cells else 1.0
+            cells = occupied(found.silhouettes[k], cell_px)
+            like_m = np.where(found.fits[[k, *seeds]] >= KNOWN, LIKE_DEPTH * self._diameter_m, np.inf)
+            limits_m = np.maximum(like_m[0], like_m[1:]).tolist()
+            overlaps = (shared(cells, *each) for each in zip(taken, limits_m, strict=True))
+            overlap = max(overlaps, default=0.0) if cells else 1.0
             still = probability(found.log_odds[k] - OVERLAP_COST * overlap)
             if overlap <= settings.overlap and still >= settings.min_score / 100:
                 seeds.append(k)
@@ -109,6 +120,13 @@ class ObjectBuilder:
         return shares
 
 
-def shared(cells: set[tuple[int, int]], other: set[tuple[int, int]]) -> float:
-    """Return the cells in common as a share of the smaller of two silhouettes, neither empty."""
-    return len(cells & other) / min(len(cells), len(other))
+def occupied(surface: FloatArray, cell_px: float) -> Cells:
+    """Return the cells of the image that pixels with their depth (Q, 3) lie in, and the depth in each."""
+    places = np.floor(surface[:, :2] / cell_px).astype(np.int64)
+    return {(u, v): depth_m for (u, v), depth_m in zip(places.tolist(), surface[:, 2].tolist(), strict=True)}
+
+
+def shared(cells: Cells, other: Cells, like_m: float) -> float:
+    """Return where two surfaces, neither empty, lie within ``like_m``, as a share of the smaller one."""
+    common = cells.keys() & other.keys()
+    return sum(abs(cells[each] - other[each]) < like_m for each in common) / min(len(cells), len(other))

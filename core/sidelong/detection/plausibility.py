@@ -16,12 +16,11 @@ from sidelong.types import FloatArray
 AT_ZERO = "at zero"
 """Name of the constant: the log-odds of a pose that nothing speaks for or against."""
 WITHOUT_DEPTH: Mapping[str, float] = {
-    AT_ZERO: -6.68, "silhouette": 2.62, "silhouette_beside": -1.24, "crease": 3.51,
-    "around": 2.95, "inside": 2.06, "facing": 2.95,
+    AT_ZERO: -5.67, "silhouette": 2.67, "crease": 2.65, "around": 2.93, "inside": 2.08, "facing": 2.39,
 }  # fmt: skip
 WITH_DEPTH: Mapping[str, float] = {
-    AT_ZERO: -4.80, "silhouette": 1.47, "crease": 2.49, "around": 2.34, "inside": 1.75, "facing": 2.85,
-    "fits": 2.56, "behind": -4.60, "before": -1.72, "flush": -1.68,
+    AT_ZERO: -3.88, "silhouette": 1.68, "crease": 1.63, "around": 2.35, "facing": 2.54,
+    "fits": 3.43, "behind": -3.29, "before": -0.89, "flush": -2.43,
 }  # fmt: skip
 
 

@@ -77,8 +77,8 @@ class DetectionSettings(BaseModel):
     contour_points: Annotated[int, Field(ge=32, le=1000)] = 160
     """Points on the contours of a hypothesis that alignment and score look at."""
     overlap: Annotated[FiniteFloat, Field(gt=0, le=1)] = 0.4
-    """An object whose silhouette is covered further than this by a better object's is a false alarm."""
-    min_score: Annotated[FiniteFloat, Field(ge=0, le=100)] = 25.0
+    """An object that has more in common with a better one, as a share of the smaller silhouette, is a false alarm."""
+    min_score: Annotated[FiniteFloat, Field(ge=0, le=100)] = 20.0
     """Probability, percent, that the best hypothesis of an object needs, as if it were the only one."""
     temperature: Annotated[FiniteFloat, Field(gt=0)] = 0.3
     """Of the softmax over the log-odds of the hypotheses of an object."""

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from sidelong.detection.settings import DetectionSettings
-from sidelong.types import FloatArray
+from sidelong.types import RealArray
 
 
-def brightness(cosine: FloatArray, settings: DetectionSettings) -> FloatArray:
+def brightness(cosine: RealArray, settings: DetectionSettings) -> RealArray:
     """Return 0..1 for the cosine (...) between outward normal and direction to the viewer.
 
     Where it faces away the ground is seen instead: ``ground_level``.

@@ -97,10 +97,12 @@ def test_measured_depth_corrects_the_distance_of_a_detection(tmp_path_factory: p
     settings = DetectionSettings(view_step_deg=30, roll_step_deg=20, distance_m=(0.6, 0.8), span_px=48)
     truths = true_poses()
     seen = RayScene([(bracket(), pose) for pose in truths]).render(CAMERA, np.eye(4))
-    half = np.where(np.arange(CAMERA.width) % 3 == 0, np.nan_to_num(seen.depth_m, nan=0.75), np.nan)
+    # pixels drop out at random: a comb of measured columns can miss every pixel that a coarse grid looks at
+    measured = np.random.default_rng(0).random(seen.depth_m.shape) < 1 / 3
+    third = np.where(measured, np.nan_to_num(seen.depth_m, nan=0.75), np.nan)
     with TemplateDetector(bracket(), CAMERA, settings, tmp_path_factory.mktemp("templates")) as detector:
         image = photograph(bracket(), truths, CAMERA)
-        blind, seeing = detector.detect(image), detector.detect(image, half)
+        blind, seeing = detector.detect(image), detector.detect(image, third)
     assert len(seeing) == 2
     errors_m = [
         [min(abs(found.hypotheses[0].camera_T_object[2, 3] - truth[2, 3]) for found in objects) for truth in truths]

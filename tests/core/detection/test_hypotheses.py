@@ -11,7 +11,7 @@ from detection_scene import CAMERA, bracket, photograph, true_poses
 from sidelong.detection.detector import TemplateDetector
 from sidelong.detection.emptiness import is_empty
 from sidelong.detection.half_turns import half_turns
-from sidelong.detection.objects import ObjectBuilder
+from sidelong.detection.objects import ObjectBuilder, occupied, shared
 from sidelong.detection.plausibility import log_odds, probability
 from sidelong.detection.proposals import Starts, poses_on_rays
 from sidelong.detection.report import NothingFound
@@ -78,8 +78,7 @@ def test_log_odds_and_probability_are_inverse():
     odds = np.array([-800.0, -2.0, 0.0, np.log(3.0), 800.0])
     np.testing.assert_allclose(probability(odds), [0.0, 1 / (1 + np.exp(2.0)), 0.5, 0.75, 1.0], atol=1e-15)
     one, zero = np.ones(1), np.zeros(1)
-    features = {"silhouette": one, "silhouette_beside": zero, "crease": one, "around": one, "inside": one,
-                "facing": zero}  # fmt: skip
+    features = {"silhouette": one, "crease": one, "around": one, "inside": one, "facing": zero}
     depth = {"fits": one, "behind": zero, "before": zero, "flush": zero}
     looked_through = {**depth, "fits": zero, "behind": one}
     assert log_odds({**features, **depth})[0] > log_odds({**features, **looked_through})[0]
@@ -91,7 +90,7 @@ def made_up(poses: list[FloatArray], log_odds: list[float]) -> Verified:
         np.column_stack([surface - 15 + CAMERA.project(pose[:3, :3] @ PART.centre_m + pose[:3, 3]), np.full(900, 0.7)])
         for pose in poses
     )
-    return Verified(np.stack(poses), np.array(log_odds), silhouettes)
+    return Verified(np.stack(poses), np.array(log_odds), np.zeros(len(poses)), silhouettes)
 
 
 def test_neighbours_are_objects_of_their_own_and_alternatives_belong_to_the_nearest():
@@ -105,6 +104,25 @@ def test_neighbours_are_objects_of_their_own_and_alternatives_belong_to_the_near
     np.testing.assert_array_equal(best.camera_T_object, right)
     assert best.probability / other.probability == pytest.approx(np.exp(0.2 / SETTINGS.temperature))
     assert best.score == pytest.approx(100 / (1 + np.exp(-1.0)))
+
+
+def test_parts_across_each_other_are_two_where_depth_tells_and_a_surface_taken_twice_is_one():
+    (u, v), across = np.meshgrid(np.arange(60.0), np.arange(20.0)), 0.65
+    lying = np.column_stack([u.ravel(), v.ravel() + 20, np.full(u.size, 0.70)])
+    upright = np.column_stack([v.ravel() + 20, u.ravel(), np.full(u.size, across)])
+    cells = [occupied(surface, 5.0) for surface in (lying, upright)]
+    assert [len(each) for each in cells] == [48, 48]
+    assert shared(*cells, like_m=0.01) == 0.0
+    assert shared(*cells, like_m=0.06) == pytest.approx(16 / 48)
+    assert shared(cells[0], cells[0], like_m=0.01) == 1.0
+    pose = transform(np.eye(3), (0.0, 0.0, 0.7))
+    aside = transform(np.eye(3), (0.03, 0.0, 0.7))
+    counts = []
+    for depth_m, fits in ((0.70, 0.5), (0.66, 0.5), (0.66, 0.0)):
+        other = np.column_stack([lying[:, :2], np.full(len(lying), depth_m)])
+        found = Verified(np.stack([pose, aside]), np.array([2.0, 1.0]), np.array([0.5, fits]), (lying, other))
+        counts.append(len(ObjectBuilder(PART, CAMERA, SETTINGS).seeds(found)))
+    assert counts == [1, 2, 1]  # what was measured on neither or one of them does not tell the two apart
 
 
 def test_improbable_hypotheses_are_dropped_and_the_rest_sums_to_one():
@@ -123,7 +141,7 @@ def test_the_visible_fraction_is_what_the_part_in_front_leaves():
     verifier = Verifier(PART, CAMERA, SETTINGS)
     looks = [verifier._appearance.look(pose[None]) for pose in (behind, before)]
     surfaces = tuple(np.column_stack([look.uv[0], look.depth_m[0]])[look.covered[0]] for look in looks)
-    found = Verified(np.stack([behind, before]), np.array([2.0, 1.0]), surfaces)
+    found = Verified(np.stack([behind, before]), np.array([2.0, 1.0]), np.zeros(2), surfaces)
     shares = ObjectBuilder(PART, CAMERA, SETTINGS).visible_fractions(found)
     both = RayScene([(PART, behind), (PART, before)]).render(CAMERA, np.eye(4)).instance
     alone = RayScene([(PART, behind)]).render(CAMERA, np.eye(4)).instance
