@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -20,8 +20,10 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from sidelong.evaluation.tradeoff import Point, PosePoint
 from sidelong_service.models import EventKind, ViewReport
+
+if TYPE_CHECKING:  # scipy and what needs it wait for the commands that use them
+    from sidelong.evaluation.tradeoff import Point, PosePoint
 
 STAGES = ("move", "capture", "detect", "refine", "score", "fuse")
 
@@ -136,7 +138,7 @@ def pose_table(points: Sequence[PosePoint]) -> Table:
     """Return the table of the poses: the paper's rate and ADD, the same modulo symmetry, parts found, seconds."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("\nstrategy", no_wrap=True)
-    headers = "views\nadded", "ADD ok\n%", "ADD\nmm", "mod sym.\n%", "ADD\nmm", "MSSD\nmm", "found\n%", "comp.\ns"
+    headers = "views\nadded", "ADD ok\n%", "ADD\nmm", "mod sym.\n%", "ADD\nmm", "MSSD\nmm", "found\n%", "\ns"
     for name in headers:
         table.add_column(name, justify="right", no_wrap=True)
     for point in points:

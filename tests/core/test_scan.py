@@ -181,7 +181,7 @@ def test_without_objects_there_is_nothing_to_plan(world: World) -> None:
 
 def test_an_empty_bin_ends_the_scan_as_such(tmp_path: Path) -> None:
     recipe = Recipe(detection=DetectionSettings(view_step_deg=40, roll_step_deg=30, distance_m=(0.65, 0.75)))
-    for empty in world_of(SimulatedCameraSettings(width=320, height=256, count=0)):
+    for empty in world_of(SimulatedCameraSettings(width=640, height=512, count=0)):
         with build_stages(recipe, empty.camera.part, empty.camera.rig, tmp_path) as stages:
             (only,) = scan(empty.cell, stages, recipe, Stopwatch())
     assert (only.stop, only.objects, only.missing_px) == (Stop.EMPTY_SCENE, (), 0)

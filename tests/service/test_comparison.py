@@ -290,8 +290,8 @@ def test_the_command_judges_poses_as_detected_and_refined(tmp_path: Path) -> Non
     assert as_detected["detected"] == refined["detected"] >= 8
     assert as_detected["visible"] >= refined["found"] >= as_detected["found"] >= 5
     assert refined["correct_symmetric"] >= 8
-    assert refined["add_symmetric_m"] < alone["add_symmetric_m"] < as_detected["add_symmetric_m"]
-    assert refined["add_symmetric_m"] < 1e-3
+    assert refined["add_symmetric_m"] < min(alone["add_symmetric_m"], as_detected["add_symmetric_m"])
+    assert refined["add_symmetric_m"] < 1e-3  # one disparity is 6.6 mm on these halved images
     for label in ("single view unrefined", "single view ", "nbv unrefined", "nbv "):
         assert label in done.stdout
 

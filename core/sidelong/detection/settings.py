@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 DistanceM = Annotated[FiniteFloat, Field(ge=0.01, le=20)]
+Listed: Any = Field(strict=False)
+"""JSON has lists and no tuples."""
 Pixel = Annotated[int, Field(ge=0, le=100_000)]
 ElevationDeg = Annotated[FiniteFloat, Field(ge=-90, le=90)]
 TurnDeg = Annotated[FiniteFloat, Field(ge=-360, le=360)]
@@ -28,14 +30,14 @@ class DetectionSettings(BaseModel):
     """Angle between neighbouring views of the viewsphere, in elevation and (on the circle) in azimuth."""
     roll_step_deg: Annotated[FiniteFloat, Field(ge=2, le=60)] = 15.0
     """Angle between neighbouring turns in the image plane."""
-    elevation_deg: tuple[ElevationDeg, ElevationDeg] = (-90.0, 90.0)
+    elevation_deg: Annotated[tuple[ElevationDeg, ElevationDeg], Listed] = (-90.0, 90.0)
     """From where a part can be seen: elevation of the camera over the xy plane of the part's own frame. Parts that
     cannot lie on their heads need no templates from below."""
-    azimuth_deg: tuple[TurnDeg, TurnDeg] = (0.0, 360.0)
+    azimuth_deg: Annotated[tuple[TurnDeg, TurnDeg], Listed] = (0.0, 360.0)
     """The same about the part's z axis, from x to y."""
-    roll_deg: tuple[TurnDeg, TurnDeg] = (0.0, 360.0)
+    roll_deg: Annotated[tuple[TurnDeg, TurnDeg], Listed] = (0.0, 360.0)
     """Direction in which the part's z axis shows in the image, clockwise from straight up."""
-    distance_m: tuple[DistanceM, DistanceM] | None = None
+    distance_m: Annotated[tuple[DistanceM, DistanceM], Listed] | None = None
     """Least and largest distance of a part from the camera in the reference view; none: where the cell or the recorded
     depth says, else ``USUAL_DISTANCE_M``."""
     distance_ratio: Annotated[FiniteFloat, Field(ge=1.02, le=2)] = 1.12
@@ -56,7 +58,7 @@ class DetectionSettings(BaseModel):
     """Brightness of the dark facets relative to the bright ones."""
     ground_level: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.2
     """Brightness of what parts lie on, relative to the bright facets."""
-    region_px: tuple[Pixel, Pixel, Pixel, Pixel] | None = None
+    region_px: Annotated[tuple[Pixel, Pixel, Pixel, Pixel], Listed] | None = None
     """(left, top, right, bottom) of the rectangle in which parts are looked for, the last two exclusive; none: all."""
     match_threshold: Annotated[FiniteFloat, Field(gt=0, le=50)] = 3.0
     """Least score of a match, in standard deviations of the edges that the image has anywhere."""

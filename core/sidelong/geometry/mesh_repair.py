@@ -9,9 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from sidelong.errors import MeshError
 from sidelong.geometry.point_sets import distinct_rows
@@ -87,6 +84,8 @@ def _without_repetitions(_name: str, shell: Shell) -> Shell:
 
 def _welded(name: str, shell: Shell) -> Shell:
     """Make one vertex of those on open edges that nearly coincide."""
+    from scipy.spatial import cKDTree
+
     edges, _triangle = _open_edges(name, shell)
     rim = np.unique(edges)
     shortest_m = float(np.linalg.norm(np.diff(shell.vertices_m[edges], axis=1), axis=2).min())
@@ -133,6 +132,9 @@ def _filled(name: str, shell: Shell) -> Shell:
 
 def _components(pairs: IntArray, size: int) -> tuple[int, IntArray]:
     """Return how many groups linked pairs (P, 2) leave of ``size`` things, and the group (size,) of each."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     links = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
     count, group = connected_components(links, directed=False)
     return int(count), np.asarray(group, dtype=np.intp)

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sidelong.errors import SettingsError
 from sidelong.geometry.transforms import rotation_about, transform
@@ -73,6 +72,8 @@ class Symmetry:
         """
         if not 0 < step_rad < np.pi:
             raise SettingsError(f"symmetry: step_rad is {step_rad}, limits 0 to pi")
+        from scipy.spatial.transform import Rotation  # not at import: the API process reads recipes without it
+
         turns = self.rotations
         if self.ball:
             turns = _all_turns(step_rad)
@@ -111,6 +112,8 @@ class Symmetry:
 
     def _spin(self, rotation_a: FloatArray, rotation_b: FloatArray) -> FloatArray:
         """Return the turn about the axis that brings a nearest to b: the twist of a swing and a twist."""
+        from scipy.spatial.transform import Rotation
+
         assert self.axis is not None
         *vector, scalar = Rotation.from_matrix(rotation_a.T @ rotation_b).as_quat()
         return rotation_about(self.axis, 2 * float(np.arctan2(np.dot(vector, self.axis), scalar)))
@@ -135,6 +138,8 @@ def _circle(step_rad: float) -> FloatArray:
 
 def _all_turns(step_rad: float) -> FloatArray:
     """Return turns (M, 3, 3) such that none is farther than half a step from one of them, identity first."""
+    from scipy.spatial.transform import Rotation
+
     # each of the three Euler angles is at most half a third of the step away
     around = _circle(step_rad / 3)
     tilts = np.linspace(0.0, np.pi, int(np.ceil(3 * np.pi / step_rad)) + 1)
