@@ -34,7 +34,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from sidelong.detection.depth_evidence import DistanceBounds
 from sidelong.detection.detector import TemplateDetector
@@ -46,9 +45,10 @@ from sidelong.detection.search_region import searched_image
 from sidelong.detection.settings import DetectionSettings
 from sidelong.detection.template_cache import load_or_train
 from sidelong.detection.templates import TemplateSet
+from sidelong.evaluation.pose_errors import PoseMetrics
+from sidelong.evaluation.silhouettes import visible_fractions
 from sidelong.geometry.mesh import Part, load_part
-from sidelong.geometry.raycast import RayScene
-from sidelong.geometry.transforms import invert, transform, transform_points
+from sidelong.geometry.transforms import invert, transform
 from sidelong.planning.candidates import DomeSettings, dome_views
 from sidelong.simulation.bin import Bin
 from sidelong.simulation.heap import heap
@@ -93,9 +93,7 @@ def photographed(part: Part, ground: str, seed: int, store: Path | None) -> Case
     image = sensor.capture(base_T_camera, Projector.OFF, IMAGE_EXPOSURE_S, depth=False).left
     depth_m = sensor.capture(base_T_camera, Projector.DOTS, DEPTH_EXPOSURE_S, depth=True).depth_m
     assert depth_m is not None
-    seen = RayScene(scene).render(rig.left, base_T_camera).instance
-    alone = [RayScene([(part, pose)]).render(rig.left, base_T_camera).instance >= 0 for pose in base_T_objects]
-    visible = np.array([np.mean(seen[mask] == k + 1) if mask.any() else 0.0 for k, mask in enumerate(alone)])
+    visible = visible_fractions(scene, rig.left, base_T_camera)[1:]
     poses = invert(base_T_camera) @ np.array(base_T_objects)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -134,7 +132,7 @@ class Tally:
         apart = np.linalg.norm(here[None, :, :2] / here[None, :, 2:] - there[:, None, :2] / there[:, None, 2:], axis=-1)
         near = apart * there[:, None, 2] < NEAR * part.diameter_m
         self.false += int((~near.any(axis=0)).sum())
-        points = part.vertices_m[:: max(1, len(part.vertices_m) // 1500)]
+        metrics = PoseMetrics(part, rig_for(*SIZE_PX).left)
         for truth, pose in enumerate(case.camera_T_objects):
             if case.visible[truth] < VISIBLE:
                 continue
@@ -148,8 +146,7 @@ class Tally:
             self.found += len(mine) > 0
             self.best += any(min(turn) < ANGLE_RAD for turn in turns)
             self.top += any(turn[0] < ANGLE_RAD for turn in turns)
-            wanted = KDTree(transform_points(pose, points))
-            errors_m = [float(np.mean(wanted.query(transform_points(top[k], points))[0])) for k in mine]
+            errors_m = [metrics.deviation(top[k], pose).adi_m for k in mine]
             if min(errors_m, default=np.inf) < CORRECT * part.diameter_m:
                 self.correct += 1
                 best = mine[int(np.argmin(errors_m))]

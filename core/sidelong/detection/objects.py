@@ -90,9 +90,8 @@ class ObjectBuilder:
         order = np.argsort(-found.log_odds, kind="stable")
         poses = found.poses[order]
         step_rad = np.radians(settings.pose_step_deg)
-        first = distinct(
-            poses[:, :3, :3], poses[:, 2, 3], step_rad, settings.hypotheses_per_object, self._symmetry
-        )  # fmt: skip
+        most = settings.hypotheses_per_object
+        first = distinct(poses[:, :3, :3], poses[:, 2, 3], step_rad, most, self._symmetry)
         kept = order[first]
         share = softmax(found.log_odds[kept], settings.temperature)
         share = np.where(share >= settings.least_probability, share, 0.0)

@@ -79,11 +79,6 @@ def cache_key(part: Part, camera: PinholeCamera, settings: DetectionSettings) ->
     return f"{safe}-{digest.hexdigest()[:20]}"
 
 
-def size_bytes(cache_dir: Path) -> int:
-    """Return what the cache takes on the disk; it grows with every part, camera and setting, and may be deleted."""
-    return sum(path.stat().st_size for path in cache_dir.rglob("*") if path.is_file())
-
-
 def _remove_abandoned(cache_dir: Path) -> None:
     """Remove what trainings left behind whose process was killed."""
     for folder in cache_dir.glob(f"{AT_WORK}*"):

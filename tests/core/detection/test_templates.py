@@ -16,7 +16,7 @@ from sidelong.detection.matcher_process import MatcherProcess, Matches
 from sidelong.detection.proposals import poses_on_rays
 from sidelong.detection.search_region import resized, search_region
 from sidelong.detection.settings import DetectionSettings
-from sidelong.detection.template_cache import cache_key, load_or_train, size_bytes
+from sidelong.detection.template_cache import cache_key, load_or_train
 from sidelong.detection.templates import FILE, TemplateSet, distances
 from sidelong.detection.viewsphere import views
 from sidelong.errors import DetectionError, ImageError, MatcherDiedError, SettingsError
@@ -127,7 +127,6 @@ def test_templates_are_trained_once(tmp_path: Path):
     assert pictures == []
     np.testing.assert_array_equal(again.axis_R_object, first.axis_R_object)
     assert [entry.name for entry in tmp_path.iterdir()] == [cache_key(bracket(), CAMERA, TINY)]
-    assert size_bytes(tmp_path) > (again.folder / FILE).stat().st_size
 
 
 @pytest.mark.parametrize("name", [FILE, "entry.json"])
