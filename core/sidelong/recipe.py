@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 from sidelong.detection.refinement_settings import RefinementSettings
 from sidelong.detection.report import DetectionReport
 from sidelong.detection.settings import DetectionSettings
-from sidelong.fusion.settings import FusionSettings
+from sidelong.fusion.settings import FusionSettings, ModelSettings
 from sidelong.physics.sensing import SensingSettings
 from sidelong.planning.light import DEFAULT_INTENSITY, LightSettings
 from sidelong.planning.selection import Strategy, StrategyName, strategy_of
@@ -138,6 +138,9 @@ class Stages:
         Stages that keep a state of their own.
     new_refiner
         Makes the refiner of one scan.
+    modelled
+        Depth of the reference view that the CAD model gives where poses are certain, and its standard deviation; None
+        where that is left out.
     light
         From geometry to the probability of depth; its exposure is replaced by the applied one.
     left_out
@@ -148,6 +151,7 @@ class Stages:
     rig: StereoRig
     detector: Detector
     new_refiner: Callable[[], PoseRefiner]
+    modelled: Callable[[tuple[DetectedObject, ...]], tuple[FloatArray, FloatArray] | None]
     strategy: Strategy
     light: LightModel
     left_out: tuple[str, ...]
@@ -198,7 +202,9 @@ def build_stages(
     strategy = strategy_of(recipe.planning.strategy, recipe.planning.seed)
     left_out = _left_out(recipe, part, given=objects is not None)
     new_refiner = _refining(recipe.refinement, part, rig) if objects is None else AsDetected
-    return Stages(part, rig, detector, new_refiner, strategy, light_model(recipe, part), left_out)
+    modelled = _modelling(recipe.fusion.model, part, rig)
+    _prepare_fusion(recipe.fusion)
+    return Stages(part, rig, detector, new_refiner, modelled, strategy, light_model(recipe, part), left_out)
 
 
 def light_model(recipe: Recipe, part: Part) -> LightModel:
@@ -235,11 +241,29 @@ def _refining(settings: RefinementSettings | None, part: Part, rig: StereoRig) -
     return partial(Refiner, part, rig.left, settings)
 
 
+def _modelling(
+    settings: ModelSettings | None, part: Part, rig: StereoRig
+) -> Callable[[tuple[DetectedObject, ...]], tuple[FloatArray, FloatArray] | None]:
+    if settings is None:
+        return lambda objects: None
+    from sidelong.fusion.modelled import modelled_depth
+
+    return partial(modelled_depth, part, rig.left, settings)
+
+
+def _prepare_fusion(settings: FusionSettings) -> None:
+    from sidelong.fusion.completion import prepare
+
+    prepare(settings)
+
+
 def _left_out(recipe: Recipe, part: Part, *, given: bool) -> tuple[str, ...]:
     """Name the terms that are not computed, each with the reason."""
     terms = {
         "detection and refinement: left out, the poses are given": given,
         "refinement of poses: left out, refinement is null": recipe.refinement is None and not given,
+        "completion by the CAD model: left out, fusion.model is null": recipe.fusion.model is None,
+        "registration of the arm's poses: left out, fusion.registration is null": recipe.fusion.registration is None,
         "second camera: left out, sensing.stereo is off": not recipe.sensing.stereo,
         "light fall-off: left out, light.fall_off is off": not recipe.light.fall_off,
         "projector vignetting: left out, light.vignetting is 0": recipe.light.vignetting == 0,

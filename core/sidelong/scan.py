@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from sidelong.detection.refinement import DepthView
 from sidelong.detection.report import DetectionReport, NothingFound
 from sidelong.devices import CaptureRequest, Cell
@@ -20,7 +22,7 @@ from sidelong.planning.prior import Belief, believe
 from sidelong.planning.selection import below_threshold, best_of
 from sidelong.recipe import PlanningSettings, Recipe, Stages
 from sidelong.stopwatch import Stopwatch
-from sidelong.types import BoolArray, DetectedObject, Forecast, Frame, Projector, Score, Step, Stop, View
+from sidelong.types import BoolArray, DetectedObject, Forecast, Frame, FusedView, Projector, Score, Step, Stop, View
 
 
 def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> Iterator[Step]:
@@ -54,24 +56,26 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
     reference = view = _move(cell, cell.reference, recipe, stopwatch)
     image = _capture(cell, view, CaptureRequest(Projector.OFF, recipe.image_exposure_s), stopwatch)
     frame = _capture(cell, view, depth_request, stopwatch)
-    completion = Completion(frame, stages.rig.left, recipe.fusion)
+    completion = Completion(frame, stages.rig, recipe.fusion)
     missing_at_first = completion.missing.copy()
 
     # 1: detection, I_o -> {q}; Line2D in the paper
     with stopwatch.stage("detect"):
-        objects = stages.detector.detect(image.left, completion.depth_m)
+        objects = stages.detector.detect(image.left, completion.depth.depth_m)
 
     refiner = stages.new_refiner()
     taken: list[View] = []
     belief: Belief | None = None
     planner: Planner | None = None
+    fused: FusedView | None = None
     gained = _Gained()
     while True:
         taken.append(view)
 
         # every depth map says more of the poses; the paper leaves them as they were detected
         with stopwatch.stage("refine"):
-            refiner.add(_depth_view(frame, view, reference))
+            if fused is None or fused.refused is None:
+                refiner.add(_depth_view(frame, view, fused))
             refined: tuple[DetectedObject, ...] = refiner.refine(objects)
 
         # 2: prior, {q} -> {D, N} at the missing pixels
@@ -81,16 +85,16 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
                     refined, stages.part, stages.rig.left, reference.base_T_camera, missing_at_first,
                     recipe.planning.stride_px,
                 )  # fmt: skip
-                completion.expect(belief.surface_m)
-            objects, planner = refined, None
-        doubtful = completion.doubtful
-        missing = completion.missing | doubtful
+            completion.expect(belief.surface_m, stages.modelled(refined))
+            objects = refined
+            planner = None
+        missing = completion.missing
         step = Step(
-            index=len(taken) - 1, view=view, frame=frame, objects=objects, depth_m=completion.depth_m.copy(),
-            source=completion.source.copy(), doubtful=doubtful, missing_px=int(belief.target.sum()),
-            recovered_px=int((belief.target & ~missing).sum()), predicted_gain_px=gained.predicted_px,
-            measured_gain_px=gained.measured_px, scores=(), stage_s={}, stop=None, left_out=stages.left_out,
-            forecast=gained.forecast,
+            index=len(taken) - 1, view=view, frame=frame, objects=objects, depth=completion.depth,
+            missing_px=int(belief.target.sum()), recovered_px=int((belief.target & ~missing).sum()),
+            predicted_gain_px=gained.predicted_px, measured_gain_px=gained.measured_px, scores=(), stage_s={},
+            stop=None, left_out=stages.left_out, forecast=gained.forecast, fused=fused,
+            scene=completion.scene,
         )  # fmt: skip
 
         # 3: G_i of each candidate, equation (13), unless the scan ends here anyway
@@ -115,11 +119,12 @@ def scan(cell: Cell, stages: Stages, recipe: Recipe, stopwatch: Stopwatch) -> It
         # 5: capture D*, fuse
         frame = _capture(cell, view, depth_request, stopwatch)
         with stopwatch.stage("fuse"):
-            completion.add(frame)
-            still_missing = completion.missing | completion.doubtful
+            fused = completion.add(frame)
+            still_missing = completion.missing
         gained = _Gained(
             predicted_px=best.gain_px,
-            measured_px=float((belief.target & missing & ~still_missing).sum()),
+            # what later views disprove is missing again
+            measured_px=float((belief.target & missing).sum()) - float((belief.target & still_missing).sum()),
             forecast=planner.forecast(view, missing, still_missing),
         )
 
@@ -133,10 +138,11 @@ class _Gained:
     forecast: Forecast | None = None
 
 
-def _depth_view(frame: Frame, view: View, reference: View) -> DepthView:
+def _depth_view(frame: Frame, view: View, fused: FusedView | None) -> DepthView:
+    """Return the depth of a view where the fusion has found it to be; the reference view is where it is."""
     if frame.depth_m is None:
         raise DepthError(f"view {view.name}: the frame has no depth map, it was captured without")
-    return DepthView(view.name, frame.depth_m, invert(reference.base_T_camera) @ view.base_T_camera)
+    return DepthView(view.name, frame.depth_m, np.eye(4) if fused is None else fused.reference_T_view)
 
 
 def _move(cell: Cell, view: View, recipe: Recipe, stopwatch: Stopwatch) -> View:

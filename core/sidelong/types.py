@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
-from typing import Any, TypeAlias
+from enum import IntEnum, StrEnum
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,13 @@ from numpy.typing import NDArray
 FloatArray: TypeAlias = NDArray[np.float64]
 RealArray: TypeAlias = NDArray[np.floating[Any]]
 """Of either precision."""
+Float32Array: TypeAlias = NDArray[np.float32]
+"""Inside kernels, where its rounding is known to be small."""
 IntArray: TypeAlias = NDArray[np.intp]
 BoolArray: TypeAlias = NDArray[np.bool_]
 GrayImage: TypeAlias = NDArray[np.uint8]
+StateArray: TypeAlias = NDArray[np.uint8]
+"""Of :class:`PixelState`."""
 
 
 class Projector(StrEnum):
@@ -198,6 +202,119 @@ class Forecast:
     measured: BoolArray
 
 
+class PixelState(IntEnum):
+    """What the depth of a pixel of the reference view rests on."""
+
+    MISSING = 0
+    """No view gave depth."""
+    MEASURED = 1
+    """The reference view measured it; it is kept to the bit."""
+    COMPLETED = 2
+    """Another view measured it."""
+    CONTRADICTED = 3
+    """The reference view measured it, but others saw through that point, or measured something before it."""
+    DOUBTFUL = 4
+    """Another view measured it, well behind the part that is believed there: likely ground seen past the part."""
+    MODELLED = 5
+    """No view gave depth; the CAD model at a certain pose says what must be there."""
+
+
+@dataclass(frozen=True, eq=False)
+class CompletedDepth:
+    """The depth of the reference view as all views show it, (H, W) each.
+
+    Attributes
+    ----------
+    depth_m
+        Along the optical axis of the reference camera, NaN where missing.
+    sigma_m
+        Its standard deviation, NaN where missing; of those contradicted or doubtful it means nothing.
+    source
+        Index of the step that measured each pixel, the lowest where several did; -1 where missing or modelled.
+    state
+        :class:`PixelState` of each pixel, uint8.
+    """
+
+    depth_m: FloatArray
+    sigma_m: FloatArray
+    source: IntArray
+    state: StateArray
+
+    @property
+    def trusted(self) -> BoolArray:
+        """Pixels whose depth was measured and is neither contradicted nor doubtful."""
+        return (self.state == PixelState.MEASURED) | (self.state == PixelState.COMPLETED)
+
+    @property
+    def trusted_m(self) -> FloatArray:
+        """Depth where it is trusted, NaN elsewhere."""
+        return np.where(self.trusted, self.depth_m, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSurface:
+    """Surfaces of a whole scene as triangles.
+
+    Attributes
+    ----------
+    points_m, normals
+        (N, 3) corners and outward unit normals there, in the base frame.
+    sigma_m
+        (N,) standard deviation along the normal.
+    triangles
+        (M, 3) counter-clockwise as seen from outside.
+    """
+
+    points_m: FloatArray
+    normals: FloatArray
+    sigma_m: FloatArray
+    triangles: IntArray
+
+
+class SceneModel(Protocol):
+    """What all views say of the whole scene, not of what the reference view sees alone."""
+
+    def mesh(self) -> SceneSurface:
+        """Return its surfaces as they are known now."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class FusedView:
+    """What the fusion made of one further view.
+
+    Attributes
+    ----------
+    reference_T_view
+        (4, 4) where it is, after registration.
+    refused
+        Why its depth was left out; None where it was taken.
+    shift_m, turn_rad
+        How far registration moved it from where the arm says.
+    sigma_shift_m, sigma_turn_rad
+        Standard deviation of where it is after that, all three directions together.
+    shared_points
+        Points of the view on surface that the reference measured too: what registration rests on.
+    agreement
+        Of the depths that the reference or the view could contradict, the share that is not; NaN where there are none.
+    filled_px
+        Pixels that had no depth before and have one now.
+    contradicted_px
+        Measured pixels of the reference that are contradicted now and were not before.
+    """
+
+    reference_T_view: FloatArray
+    refused: str | None
+    shift_m: float
+    turn_rad: float
+    sigma_shift_m: float
+    sigma_turn_rad: float
+    shared_points: int
+    agreement: float
+    filled_px: int = 0
+    contradicted_px: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
     """What a scan knows after a view. The first step is the reference view.
@@ -212,18 +329,15 @@ class Step:
         The depth capture of this view.
     objects
         What was detected in the reference view.
-    depth_m
-        (H, W) completed depth of the reference view, NaN where missing.
-    source
-        (H, W) index of the step that measured each pixel, -1 where missing.
-    doubtful
-        (H, W) completed pixels whose depth lies well behind the part believed there: ground seen past it.
+    depth
+        The reference view's, as it is completed now.
     missing_px
         Pixels on the detected objects that had no depth in the reference view.
     recovered_px
-        How many of those have depth now that is not doubtful.
+        How many of those have depth now that was measured and is not doubtful.
     predicted_gain_px, measured_gain_px
-        Gain of this view: G of equation (13) beforehand, newly completed target pixels afterwards; 0 at the reference.
+        Gain of this view: G of equation (13) beforehand, newly completed target pixels afterwards, less those it
+        disproved; 0 at the reference.
     scores
         All candidates, as scored before the next move; empty where the scan ended before scoring.
     stage_s
@@ -234,15 +348,17 @@ class Step:
         Terms of the model that were left out, each with the reason.
     forecast
         What was promised of this view, point by point, beside what it gave; None at the reference.
+    fused
+        What the fusion made of this view; None at the reference.
+    scene
+        The whole scene, where the fusion models it; it goes on to learn from the views of later steps.
     """
 
     index: int
     view: View
     frame: Frame
     objects: tuple[DetectedObject, ...]
-    depth_m: FloatArray
-    source: IntArray
-    doubtful: BoolArray
+    depth: CompletedDepth
     missing_px: int
     recovered_px: int
     predicted_gain_px: float
@@ -252,6 +368,8 @@ class Step:
     stop: Stop | None
     left_out: tuple[str, ...] = ()
     forecast: Forecast | None = None
+    fused: FusedView | None = None
+    scene: SceneModel | None = None
 
     @property
     def completeness(self) -> float:

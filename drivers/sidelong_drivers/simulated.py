@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from sidelong.devices import CaptureRequest
 from sidelong.errors import DeviceUnavailableError, SettingsError
 from sidelong.geometry.camera_model import StereoRig
 from sidelong.geometry.mesh import Part
-from sidelong.geometry.transforms import transform, validated_transform
+from sidelong.geometry.transforms import rotation_about, transform, validated_transform
 from sidelong.simulation.bin import Bin, fill_bin
 from sidelong.simulation.heap import heap
 from sidelong.simulation.parts import simulated_part
@@ -43,6 +44,12 @@ class SimulatedCameraSettings(BaseModel):
     bin_origin_m: Triple = Field(default=(0.5, 0.0, 0.0), description="centre of the bin's floor in the base frame")
     mount_m: Triple = Field(
         default=(-BASELINE_M / 2, -0.06, 0.05), description="left camera in the flange frame; both look the same way"
+    )
+    arm_shift_m: FiniteFloat = Field(
+        default=0.0, ge=0.0, le=0.1, description="how far the camera is from where the arm says, standard deviation"
+    )
+    arm_turn_rad: FiniteFloat = Field(
+        default=0.0, ge=0.0, le=0.1, description="how far it is turned from there, standard deviation"
     )
     sensor: SensorSettings = Field(default=SensorSettings(), description="light, pattern, pixel and matcher")
 
@@ -142,7 +149,7 @@ class SimulatedCamera:
             )
         pose = validated_transform(base_T_camera, f"{self.name}: base_T_camera")
         started_s = time.monotonic()
-        shot = sensor.capture(pose, request.projector, request.exposure_s, request.depth)
+        shot = sensor.capture(self._truly_at(pose), request.projector, request.exposure_s, request.depth)
         return Frame(
             view=View("simulated", pose),
             left=shot.left,
@@ -156,7 +163,20 @@ class SimulatedCamera:
 
     def true_depth_m(self, base_T_camera: FloatArray) -> FloatArray:
         """Return the depth (H, W) a perfect sensor would measure, NaN where nothing is; for evaluation."""
-        return self._opened().true_depth_m(base_T_camera)
+        return self._opened().true_depth_m(self._truly_at(base_T_camera))
+
+    def _truly_at(self, base_T_camera: FloatArray) -> FloatArray:
+        """Return where the camera is when the arm says that it is there: the same error at the same place each time."""
+        shift_m, turn_rad = self.settings.arm_shift_m, self.settings.arm_turn_rad
+        if not (shift_m or turn_rad):
+            return base_T_camera
+        digest = hashlib.blake2b(np.round(base_T_camera, 6).tobytes(), digest_size=16).digest()
+        drawn = np.random.default_rng([self.settings.seed, int.from_bytes(digest)]).normal(size=(2, 3)) / np.sqrt(3)
+        there = base_T_camera.copy()
+        there[:3, 3] += shift_m * drawn[0]
+        angle_rad = turn_rad * float(np.linalg.norm(drawn[1]))
+        there[:3, :3] = there[:3, :3] @ rotation_about(drawn[1], angle_rad)
+        return there
 
     def _opened(self) -> ActiveStereoSensor:
         if self._sensor is None:

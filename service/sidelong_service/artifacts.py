@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 from collections.abc import Callable, Mapping
@@ -17,13 +16,10 @@ from sidelong.detection.report import DetectionReport
 from sidelong.evaluation.reliability import Reliability
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
-from sidelong.geometry.transforms import transform_points
-from sidelong.types import FloatArray, GrayImage, Step
+from sidelong.types import GrayImage, SceneModel, Step
+from sidelong_service.depth_files import DepthFiles, intrinsics_of, npz
 from sidelong_service.models import Artifact, Setup, ViewReport, rows_of
-
-DEPTH_UNIT_M = 1e-4
-"""Of the 16-bit depth picture: 0.1 mm reaches 6.5 m, and is a sixth of what the sensor repeats to at 0.7 m."""
-LARGEST_PNG_DEPTH_M = 65535 * DEPTH_UNIT_M
+from sidelong_service.ply import ply
 
 MEDIA_TYPES = {".png": "image/png", ".npz": "application/octet-stream", ".ply": "application/octet-stream",
                ".json": "application/json"}  # fmt: skip
@@ -75,7 +71,7 @@ def write_view(folder: Path, step: Step) -> Artifact:
     arrays: dict[str, Any] = {"left": step.frame.left, "base_T_camera": step.view.base_T_camera}
     if step.frame.depth_m is not None:
         arrays["depth_m"] = step.frame.depth_m.astype(np.float32)
-    return _write(folder / f"view_{step.index:02d}.npz", _npz(arrays))
+    return _write(folder / f"view_{step.index:02d}.npz", npz(arrays))
 
 
 def write_results(
@@ -85,61 +81,34 @@ def write_results(
     step = record.last
     if step is None:
         return []
+    depth = _depth_files(step, record)
     contents = {
-        "depth.png": depth_png(_trusted_m(step)),
-        "depth.npz": _depth_npz(step, record),
-        "cloud.ply": _cloud(step, record),
+        **depth.contents(),
+        **_scene_files(step.scene),
         "poses.json": _poses(step, record),
         **draw(record),
-        "report.json": _report(step, record),
+        "report.json": _report(step, record, depth.legend()),
     }
     return [_write(folder / name, content) for name, content in contents.items()]
 
 
-def depth_png(depth_m: FloatArray) -> bytes:
-    """Return depth (H, W) as a 16-bit PNG in units of ``DEPTH_UNIT_M``; 0 where missing or beyond its range."""
-    import cv2
-
-    held = (depth_m > 0) & (depth_m <= LARGEST_PNG_DEPTH_M)
-    units = np.where(held, np.rint(depth_m / DEPTH_UNIT_M), 0).astype(np.uint16)
-    return cv2.imencode(".png", units)[1].tobytes()
+def _depth_files(step: Step, record: Record) -> DepthFiles:
+    reference = _reference(record)
+    image = record.image if record.image is not None else reference.frame.left
+    names = [view.view for view in record.views]
+    return DepthFiles(step.depth, record.camera, reference.view.base_T_camera, image, names)
 
 
-def ply(points_m: FloatArray, gray: GrayImage) -> bytes:
-    """Return points (N, 3) with a gray value (N,) each as a binary PLY file."""
-    header = [
-        "ply", "format binary_little_endian 1.0", "comment metres, base frame", f"element vertex {len(points_m)}",
-        *(f"property float {axis}" for axis in "xyz"), *(f"property uchar {c}" for c in ("red", "green", "blue")),
-        "end_header",
-    ]  # fmt: skip
-    vertices = np.empty(len(points_m), dtype=[("point", "<f4", 3), ("colour", "u1", 3)])
-    vertices["point"], vertices["colour"] = points_m, gray[:, None]
-    return ("\n".join(header) + "\n").encode() + vertices.tobytes()
-
-
-def _trusted_m(step: Step) -> FloatArray:
-    """Return the completed depth without what is doubtful: a picture and a cloud have no room for the mark."""
-    return np.where(step.doubtful, np.nan, step.depth_m)
-
-
-def _cloud(step: Step, record: Record) -> bytes:
-    measured = np.isfinite(_trusted_m(step))
-    points_camera = record.camera.pixel_rays()[measured] * step.depth_m[measured][:, None]
-    image = record.image if record.image is not None else step.frame.left
-    return ply(transform_points(_reference(record).view.base_T_camera, points_camera), image[measured])
-
-
-def _depth_npz(step: Step, record: Record) -> bytes:
-    return _npz(
-        {
-            "depth_m": step.depth_m,
-            "source": step.source.astype(np.int16),
-            "doubtful": step.doubtful,
-            "K": _intrinsics(record.camera),
-            "base_T_camera": _reference(record).view.base_T_camera,
-            "views": np.array([view.view for view in record.views]),
-        }
-    )
+def _scene_files(scene: SceneModel | None) -> dict[str, bytes]:
+    """Return mesh and points of the whole bin, where the fusion models it."""
+    if scene is None:
+        return {}
+    surface = scene.mesh()
+    points_m, normals = surface.points_m, surface.normals
+    return {
+        "bin_mesh.ply": ply(points_m, normals, triangles=surface.triangles),
+        "bin_cloud.ply": ply(points_m, normals),
+    }
 
 
 def _poses(step: Step, record: Record) -> bytes:
@@ -172,27 +141,20 @@ def _poses(step: Step, record: Record) -> bytes:
     return json.dumps(document, indent=1, allow_nan=False).encode()
 
 
-def _report(step: Step, record: Record) -> bytes:
-    beyond_px = int((step.depth_m > LARGEST_PNG_DEPTH_M).sum())
+def _report(step: Step, record: Record, files: dict[str, Any]) -> bytes:
     document = {
         "finish_reason": step.stop,
         "completeness": step.completeness,
         "missing_px": step.missing_px,
         "recovered_px": step.recovered_px,
-        "doubtful_px": int(step.doubtful.sum()),
         "setup": record.setup.model_dump(mode="json", exclude={"recipe"}),
         "detection": None if record.detection is None else _detection(record.detection),
         "views": [view.model_dump(mode="json") for view in record.views],
         "reliability": record.reliability.report().model_dump(mode="json"),
         "recipe": record.setup.recipe,
-        "K": _intrinsics(record.camera).tolist(),
+        "K": intrinsics_of(record.camera).tolist(),
         "base_T_camera": _reference(record).view.base_T_camera.tolist(),
-        "depth_png": {
-            "unit_m": DEPTH_UNIT_M,
-            "missing": 0,
-            "largest_m": LARGEST_PNG_DEPTH_M,
-            "beyond_largest_px": beyond_px,
-        },
+        **files,
     }
     return json.dumps(document, indent=1, allow_nan=False).encode()
 
@@ -205,16 +167,6 @@ def _reference(record: Record) -> Step:
     if record.first is None:
         raise ValueError("the record has no reference view yet")
     return record.first
-
-
-def _intrinsics(camera: PinholeCamera) -> FloatArray:
-    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-
-
-def _npz(arrays: dict[str, Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
-    return buffer.getvalue()
 
 
 def write_whole(path: Path, content: bytes) -> None:

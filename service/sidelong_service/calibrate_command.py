@@ -9,7 +9,15 @@ from typing import Annotated, Any
 import typer
 from pydantic import ValidationError
 
-from sidelong.commissioning.tasks import HandEyeTask, MaterialTask, ProjectorTask, ResponseTask, SensingTask, Task
+from sidelong.commissioning.tasks import (
+    HandEyeTask,
+    MaterialTask,
+    NoiseTask,
+    ProjectorTask,
+    ResponseTask,
+    SensingTask,
+    Task,
+)
 from sidelong_service.client import SidelongClient
 from sidelong_service.command import (
     Calibrations,
@@ -108,6 +116,20 @@ def hand_eye(
 ) -> None:
     """Find where the camera sits on the flange from images of a board."""
     _make(HandEyeTask(arm=arm), dataset, object_name, output=output, url=url)
+
+
+@calibrate.command()
+def noise(
+    dataset: DataSet,
+    object_name: Object = None,
+    repeats: Annotated[
+        bool, typer.Option("--repeats", help="From repeated shots of one scene: a lower bound.")
+    ] = False,
+    output: Output = HERE,
+    url: Url = None,
+) -> None:
+    """Fit the noise of depth to captures of a flat plate, at several tilts and distances."""
+    _make(NoiseTask(method="repeats" if repeats else "plate"), dataset, object_name, output=output, url=url)
 
 
 def _make(

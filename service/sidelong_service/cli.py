@@ -30,7 +30,14 @@ from sidelong_service.command import (
     plain_errors,
     recipe_of,
 )
-from sidelong_service.console import CountedProgress, ScanProgress, comparison_table, pose_table, view_table
+from sidelong_service.console import (
+    CountedProgress,
+    ScanProgress,
+    comparison_table,
+    depth_table,
+    pose_table,
+    view_table,
+)
 from sidelong_service.models import EventKind, RecordedScene, RunState, ScanRequest
 from sidelong_service.record_command import record
 
@@ -127,6 +134,9 @@ def compare(
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs of the random strategy.")] = 5,
     true_poses: Annotated[bool, typer.Option("--true-poses", help="Leave out detection; take the true poses.")] = False,
     poses: Annotated[bool, typer.Option("--poses", help="Judge the poses as well (the paper's Table 2).")] = False,
+    depth: Annotated[
+        bool, typer.Option("--depth", help="Judge the errors of the depth and its sigma as well.")
+    ] = False,
     refinement: Annotated[str, typer.Option(help="Of poses by depth: on, off (as the paper), or both.")] = "on",
     recipe: RecipeFile = None,
     calibration: Calibrations = None,
@@ -154,6 +164,7 @@ def compare(
             true_poses=true_poses,
             documents=documents_of(calibration),
             poses=poses,
+            depth=depth,
         )
         _compare(comparison, json_file, plot)
 
@@ -163,14 +174,13 @@ def _compare(comparison: Comparison, json_file: Path | None, plot: Path) -> None
     from sidelong_service.artifacts import write_whole
 
     rows: list[Row] = []
-    rows_each = len(comparison.runs) * (comparison.recipe.planning.max_views + comparison.poses)
-    total = len(comparison.cases) * rows_each
+    total = len(comparison.cases) * comparison.rows_each
     ended_by: KeyboardInterrupt | SidelongError | None = None
     with CountedProgress(err) as progress:
 
         def skip(case: Case, why: str) -> None:
             nonlocal total
-            total -= rows_each
+            total -= comparison.rows_each
             progress.note(f"left out: {case.object} scene {case.scene} {case.reference}: {why}")
 
         def train(done: int, pictures: int) -> None:
@@ -197,7 +207,7 @@ def _compare(comparison: Comparison, json_file: Path | None, plot: Path) -> None
 
 
 def _show_comparison(rows: list[Row], plot: Path) -> None:
-    from sidelong.evaluation.tradeoff import draw, summarise, summarise_poses
+    from sidelong.evaluation.tradeoff import draw, summarise, summarise_depth, summarise_poses
     from sidelong_service.artifacts import write_whole
 
     points = summarise(rows)
@@ -205,6 +215,9 @@ def _show_comparison(rows: list[Row], plot: Path) -> None:
     judged = summarise_poses(rows)
     if judged:
         out.print(pose_table(judged))
+    errors = summarise_depth(rows)
+    for on_parts in (True, False) if errors else ():
+        out.print(depth_table(errors, on_parts=on_parts))
     write_whole(plot, draw(points, f"{', '.join(dict.fromkeys(row.object for row in rows))}: {len(rows)} rows"))
     out.print(f"  {plot}", highlight=False, markup=False, soft_wrap=True)
 

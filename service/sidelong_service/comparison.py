@@ -43,8 +43,8 @@ class Comparison:
         Whether the true poses stand in for detection.
     documents
         Calibrations that go before what the recipe says.
-    poses
-        Whether poses are judged as well.
+    poses, depth
+        Whether poses, and errors of the depth, are judged as well.
     """
 
     dataset: Dataset
@@ -55,6 +55,13 @@ class Comparison:
     true_poses: bool = False
     documents: tuple[Document, ...] = ()
     poses: bool = False
+    depth: bool = False
+
+    @property
+    def rows_each(self) -> int:
+        """How many rows a reference view gives."""
+        alone = self.poses or self.depth
+        return len(self.runs) * (self.recipe.planning.max_views + alone)
 
     def rows(
         self, skipped: Callable[[Case, str], None], progress: Callable[[int, int], None] | None = None
@@ -107,5 +114,6 @@ class Comparison:
                 if self.true_poses:
                     mine = replace(stages, detector=GivenObjects(true_objects(scene, reference)))
                 cell = Cell(camera, arm, np.eye(4), reference, views)
-                yardstick = Yardstick(truth, judge_in(scene, reference, metrics) if metrics is not None else None)
+                judge = judge_in(scene, reference, metrics) if metrics is not None else None
+                yardstick = Yardstick(truth, judge, self.depth)
                 yield from compare_reference(case, cell, mine, recipe, yardstick, self.runs)

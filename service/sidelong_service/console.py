@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -23,7 +24,8 @@ from rich.table import Table
 from sidelong_service.models import EventKind, ViewReport
 
 if TYPE_CHECKING:  # scipy and what needs it wait for the commands that use them
-    from sidelong.evaluation.tradeoff import Point, PosePoint
+    from sidelong.evaluation.depth_score import DepthErrors
+    from sidelong.evaluation.tradeoff import DepthPoint, Point, PosePoint
 
 STAGES = ("move", "capture", "detect", "refine", "score", "fuse")
 
@@ -81,11 +83,22 @@ class ScanProgress(_Bars):
     def _show_view(self, view: ViewReport) -> None:
         self.views.append(view)
         self._progress.update(self._phase, state=f"{view.completeness:.0%} complete")
-        if view.index == 0:
-            text = f"{view.objects} objects, {view.missing_px} px without depth on them"
-        else:
-            text = f"gain {view.measured_gain_px:.0f} px, {view.completeness:.1%} complete"
-        self.note(f"  view {view.index}  {view.view}: {text}")
+        self.note(f"  view {view.index}  {view.view}: {told(view)}")
+
+
+def told(view: ViewReport) -> str:
+    """Return what a view gave in one line; of one that was refused, why."""
+    if view.index == 0:
+        return f"{view.objects} objects, {view.missing_px} px without depth on them"
+    if view.refused is not None:
+        return f"refused: {view.refused}"
+    words = [f"gain {view.measured_gain_px:.0f} px", f"{view.completeness:.1%} complete"]
+    fused = view.fused
+    if fused is not None and fused.shared_points:
+        words.append(f"moved by {fused.shift_m * 1e3:.2f} mm, {math.degrees(fused.turn_rad):.3f} degrees")
+    if fused is not None and fused.contradicted_px:
+        words.append(f"{fused.contradicted_px} px contradicted")
+    return ", ".join(words)
 
 
 def view_table(views: Sequence[ViewReport]) -> Table:
@@ -95,7 +108,8 @@ def view_table(views: Sequence[ViewReport]) -> Table:
     for name in ("expected\ngain px", "measured\ngain px", "\ncomplete", *(f"{stage}\ns" for stage in STAGES)):
         table.add_column(name, justify="right")
     for view in views:
-        gains = ("", "") if view.index == 0 else (f"{view.predicted_gain_px:.0f}", f"{view.measured_gain_px:.0f}")
+        measured = f"{view.measured_gain_px:.0f}" if view.refused is None else "refused"
+        gains = ("", "") if view.index == 0 else (f"{view.predicted_gain_px:.0f}", measured)
         seconds = [f"{view.stage_s[stage]:.2f}" if stage in view.stage_s else "" for stage in STAGES]
         table.add_row(f"{view.index} {view.view}", *gains, f"{view.completeness:.1%}", *seconds)
     return table
@@ -154,3 +168,32 @@ def pose_table(points: Sequence[PosePoint]) -> Table:
             f"{point.compute_s:.2f}",
         )
     return table
+
+
+def depth_table(points: Sequence[DepthPoint], *, on_parts: bool) -> Table:
+    """Return the table of the depth, on the parts or everywhere: errors of filled pixels, the 95th percentile of the
+    rest that is within 2 mm, whether sigma is honest, and the sensor's own where the reference view measured."""
+    title = "errors of the depth on the parts" if on_parts else "errors of the depth wherever the truth is known"
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, title=title, title_justify="left")
+    table.add_column("\nstrategy", no_wrap=True)
+    errors = "med.\nmm", "95 %\nmm", ">2 mm\n%", "rest\n95 %"
+    for name in ("\nviews", "filled\npx", *errors, "err/\nsig", "cov.\n%", "sens.\nmm", "95 %\nmm"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for point in points:
+        if point.on_parts == on_parts:
+            numbers = *_errors(point.completed), *_millimetres(point.measured)
+            table.add_row(point.label, str(point.views_added), *numbers)
+    return table
+
+
+def _errors(of: DepthErrors) -> tuple[str, ...]:
+    sigma = _number(of.normalised_std, 1, 2), _number(of.coverage, 100, 1)
+    return str(of.pixels), *_millimetres(of), _number(of.beyond, 100, 1), _number(of.recovered_p95_m, 1e3, 2), *sigma
+
+
+def _millimetres(of: DepthErrors) -> tuple[str, ...]:
+    return _number(of.median_m, 1e3, 2), _number(of.p95_m, 1e3, 2)
+
+
+def _number(value: float | None, unit: float, digits: int) -> str:
+    return "" if value is None else f"{value * unit:.{digits}f}"

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sidelong.commissioning.tasks import Task
 from sidelong.recipe import Recipe
-from sidelong.types import DetectedObject, FloatArray, Step, Stop
+from sidelong.types import DetectedObject, FloatArray, FusedView, PixelState, StateArray, Step, Stop
 from sidelong_service.problems import Problem
 from sidelong_service.settings import Name
 
@@ -153,8 +153,56 @@ def sigmas_of(covariance: FloatArray) -> tuple[float, float]:
     return turn, shift
 
 
+class FusionReport(_Answer):
+    """What the fusion made of the depth of a further view.
+
+    ``refused`` says why it was left out; none: it was taken. ``shift_m`` and ``turn_rad`` are how far registration
+    moved the view from where the arm says, ``base_T_camera`` (4x4, row by row) is where it is then, and the sigmas are
+    how well that is known. ``agreement`` is the share of what the view and the reference both saw that neither
+    contradicts; none where they share nothing. ``filled_px`` had no depth before; ``contradicted_px`` of the reference
+    are contradicted since.
+    """
+
+    refused: str | None
+    base_T_camera: tuple[tuple[float, ...], ...]
+    shift_m: float
+    turn_rad: float
+    sigma_shift_m: float
+    sigma_turn_rad: float
+    shared_points: int
+    agreement: float | None
+    filled_px: int
+    contradicted_px: int
+
+    @classmethod
+    def of(cls, fused: FusedView, base_T_reference: FloatArray) -> FusionReport:
+        """Return the report of a view; ``base_T_reference`` (4, 4) is the camera at the reference view."""
+        return cls(
+            refused=fused.refused,
+            base_T_camera=rows_of(base_T_reference @ fused.reference_T_view),
+            shift_m=fused.shift_m,
+            turn_rad=fused.turn_rad,
+            sigma_shift_m=fused.sigma_shift_m,
+            sigma_turn_rad=fused.sigma_turn_rad,
+            shared_points=fused.shared_points,
+            agreement=None if math.isnan(fused.agreement) else fused.agreement,
+            filled_px=fused.filled_px,
+            contradicted_px=fused.contradicted_px,
+        )
+
+
+def state_px_of(state: StateArray) -> dict[str, int]:
+    """Return how many pixels (H, W) are in each state, by its name in lower case."""
+    counts = np.bincount(state.ravel(), minlength=len(PixelState))
+    return {each.name.lower(): int(counts[each]) for each in PixelState}
+
+
 class ViewReport(_Answer):
-    """One view of a scan: the gain expected and measured, the state after it, and what it cost."""
+    """One view of a scan: the gain expected and measured, the state after it, and what it cost.
+
+    ``state_px`` counts the pixels of the reference view by what their depth rests on; ``fused`` is what the fusion made
+    of this view, none at the reference. Scans of older versions have neither.
+    """
 
     index: int
     view: str
@@ -167,6 +215,13 @@ class ViewReport(_Answer):
     completeness: float
     stage_s: dict[str, float]
     candidates: tuple[Candidate, ...]
+    state_px: dict[str, int] = {}
+    fused: FusionReport | None = None
+
+    @property
+    def refused(self) -> str | None:
+        """Why the fusion left this view out, if it did."""
+        return None if self.fused is None else self.fused.refused
 
     @classmethod
     def of(cls, step: Step, base_T_reference: FloatArray) -> ViewReport:
@@ -192,6 +247,8 @@ class ViewReport(_Answer):
                 )
                 for s in step.scores
             ),
+            state_px=state_px_of(step.depth.state),
+            fused=None if step.fused is None else FusionReport.of(step.fused, base_T_reference),
         )
 
 

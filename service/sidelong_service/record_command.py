@@ -96,9 +96,27 @@ def plane(
     view: ViewName = None,
     config: ConfigFile = None,
 ) -> None:
-    """Take one more capture of a matte plane: for `sidelong calibrate projector`."""
+    """Take one more capture of a matte plane: for `sidelong calibrate projector` and `noise`."""
     with plain_errors():
         _record(config, root, object_name, view, lambda recorder: recorder.plane(exposure_ms * 1e-3))
+
+
+@record.command()
+def repeats(
+    root: Root,
+    count: Annotated[int, typer.Option(min=5, max=40, help="Shots of the same scene.")] = 20,
+    exposure_ms: Exposure = PROJECTOR_ON_MS,
+    object_name: Object = None,
+    view: ViewName = None,
+    config: ConfigFile = None,
+) -> None:
+    """Take the depth of a scene at rest again and again: for `sidelong calibrate noise --repeats`."""
+    with plain_errors(), CountedProgress(err) as progress:
+
+        def show(done: int, total: int) -> None:
+            progress.show("shots", done, total)
+
+        _record(config, root, object_name, view, lambda recorder: recorder.repeats(exposure_ms * 1e-3, count, show))
 
 
 @record.command()

@@ -16,13 +16,14 @@ from sidelong.detection.refinement_settings import RefinementSettings
 from sidelong.detection.settings import DetectionSettings
 from sidelong.devices import Cell
 from sidelong.errors import DepthError, DeviceTimeoutError, DeviceUnavailableError
+from sidelong.fusion.settings import FusionSettings, ModelSettings, RegistrationSettings
 from sidelong.geometry.transforms import invert, rotation_about, transform
 from sidelong.planning.candidates import DomeSettings, dome_views
 from sidelong.planning.selection import StrategyName
 from sidelong.recipe import PlanningSettings, Recipe, build_stages
 from sidelong.scan import scan
 from sidelong.stopwatch import Stopwatch
-from sidelong.types import DetectedObject, Hypothesis, Step, Stop, View
+from sidelong.types import DetectedObject, Hypothesis, PixelState, Step, Stop, View
 from sidelong_drivers.mock import MockArm, MockArmSettings
 from sidelong_drivers.simulated import SimulatedCamera, SimulatedCameraSettings
 
@@ -105,7 +106,7 @@ def test_the_next_view_is_the_candidate_of_largest_gain(steps: list[Step]) -> No
 def test_gains_add_up_and_completeness_rises(steps: list[Step]) -> None:
     assert steps[0].missing_px > 100
     assert steps[-1].recovered_px == sum(step.measured_gain_px for step in steps) > 0
-    assert [step.completeness for step in steps] == sorted(step.completeness for step in steps)
+    assert all(after.completeness > before.completeness - 0.01 for before, after in pairwise(steps))
     assert steps[-1].completeness == steps[-1].recovered_px / steps[-1].missing_px
 
 
@@ -114,17 +115,17 @@ def test_what_the_reference_view_measured_stays_to_the_bit(steps: list[Step]) ->
     assert reference_m is not None
     measured = np.isfinite(reference_m)
     for step in steps:
-        assert np.array_equal(step.depth_m[measured], reference_m[measured])
-        assert np.array_equal(step.source == 0, measured)
-        assert np.array_equal(step.source == -1, np.isnan(step.depth_m))
-        assert step.source.max() <= step.index
+        assert np.array_equal(step.depth.depth_m[measured], reference_m[measured])
+        assert np.array_equal(step.depth.source == 0, measured)
+        assert np.array_equal(step.depth.source == -1, np.isnan(step.depth.depth_m))
+        assert step.depth.source.max() <= step.index
 
 
 def test_what_was_completed_is_near_the_truth(world: World, steps: list[Step]) -> None:
     truth_m = world.camera.true_depth_m(steps[0].view.base_T_camera)
-    new = steps[-1].source > 0
+    new = steps[-1].depth.source > 0
     # one disparity of this small image is 6.6 mm at this distance
-    assert np.median(np.abs(steps[-1].depth_m - truth_m)[new]) < 2e-3
+    assert np.median(np.abs(steps[-1].depth.depth_m - truth_m)[new]) < 3e-3
 
 
 def test_each_stage_is_timed_and_left_out_terms_are_named(steps: list[Step]) -> None:
@@ -166,6 +167,50 @@ def test_poses_are_refined_by_every_view_and_stay_as_detected_where_that_is_left
     assert errors_m(world, refined[-1]).mean() < errors_m(world, refined[0]).mean() < 4e-3
     assert {view for item in refined[-1].objects for view in item.supporting_views} == {s.view.name for s in refined}
     assert all(item.hypotheses[0].covariance is not None for item in refined[-1].objects)
+
+
+def test_small_errors_of_the_arm_are_registered_and_reported_and_that_can_be_left_out() -> None:
+    """0.3 mm and 0.9 mrad; what it is worth is shown in tests/core/fusion/test_completion.py."""
+    for registration in (RegistrationSettings(), None):
+        settings = SimulatedCameraSettings(count=4, arm_shift_m=0.3e-3, arm_turn_rad=0.9e-3)
+        for world in world_of(settings):
+            taken = steps_of(world, recipe=Recipe(fusion=FusionSettings(registration=registration)))
+            fused = [step.fused for step in taken[1:] if step.fused is not None]
+            assert len(fused) == len(taken) - 1
+            assert all(each.refused is None and each.agreement > 0.99 for each in fused)
+            assert all((each.shift_m > 1e-5) == (registration is not None) for each in fused)
+            assert all((each.sigma_shift_m > 0) == (registration is not None) for each in fused)
+            named = [term for term in taken[0].left_out if term.startswith("registration")]
+            assert bool(named) == (registration is None)
+
+
+def test_views_from_wrong_poses_are_refused_and_the_scan_goes_on_without_them() -> None:
+    """An arm that is 50 mm off each time: no view fits the reference, none is fused, and the scan ends as it should."""
+    for world in world_of(SimulatedCameraSettings(count=4, arm_shift_m=0.05)):
+        taken = steps_of(world, max_views=3)
+        assert taken[-1].stop is not None
+        assert len(taken) == 4
+        for step in taken[1:]:
+            assert step.fused is not None
+            assert step.fused.refused is not None
+            assert (step.fused.filled_px, step.measured_gain_px, step.recovered_px) == (0, 0, 0)
+        assert set(np.unique(taken[-1].depth.source)) == {-1, 0}
+
+
+def test_the_model_completes_what_no_view_measured_where_that_is_asked_for(sharp_world: World) -> None:
+    """Detected poses, a little off, are refined by depth; then the CAD model fills in, marked, and is not counted."""
+    recipe = Recipe(fusion=FusionSettings(model=ModelSettings()), planning=PlanningSettings(max_views=0))
+    part, rig = sharp_world.camera.part, sharp_world.camera.rig
+    with build_stages(recipe, part, rig, Path(), objects=disturbed(sharp_world)) as stages:
+        refined = replace(stages, new_refiner=partial(Refiner, part, rig.left, RefinementSettings()))
+        taken = list(scan(sharp_world.cell, refined, recipe, Stopwatch()))
+    last = taken[-1]
+    modelled = last.depth.state == PixelState.MODELLED
+    assert modelled.sum() > 100
+    truth_m = sharp_world.camera.true_depth_m(taken[0].view.base_T_camera)
+    assert np.median(np.abs(last.depth.depth_m - truth_m)[modelled]) < 1e-3
+    assert not last.depth.trusted[modelled].any()
+    assert last.recovered_px <= last.missing_px - modelled.sum()
 
 
 def test_views_are_where_the_arm_says_it_is(world: World, steps: list[Step]) -> None:

@@ -160,3 +160,17 @@ def test_spray_leaves_parts_where_they_are_and_makes_their_depth_complete() -> N
     assert shares[0] < 0.6
     # what stays missing at this size are edges
     assert shares[1] > 0.7
+
+
+def test_an_arm_that_errs_puts_the_camera_elsewhere_the_same_way_each_time(camera):
+    """0.3 mm and 0.9 mrad: the frame says where the arm said it is, and shows what is seen from beside it."""
+    erring = small(arm_shift_m=0.3e-3, arm_turn_rad=0.9e-3)
+    erring.open()
+    frames = [erring.capture(DOTS, POSE) for _ in range(2)]
+    assert np.array_equal(frames[0].depth_m, frames[1].depth_m, equal_nan=True)
+    assert np.allclose(frames[0].view.base_T_camera, POSE)
+    moved_m = np.abs(erring.true_depth_m(POSE) - camera.true_depth_m(POSE))
+    assert 1e-5 < np.nanmedian(moved_m) < 2e-3
+    elsewhere = look_at((0.5, 0.06, 0.7), (0.5, 0.0, 0.0))
+    offset = np.nanmedian(erring.true_depth_m(POSE) - camera.true_depth_m(POSE))
+    assert abs(np.nanmedian(erring.true_depth_m(elsewhere) - camera.true_depth_m(elsewhere)) - offset) > 1e-6

@@ -230,6 +230,25 @@ def test_options_out_of_range_are_told_with_the_usage(desk: Path, arguments: tup
     assert message in " ".join(done.stderr.split())
 
 
+def test_noise_is_calibrated_from_planes_and_used_by_a_scan(desk: Path) -> None:
+    for view in ("top", "e70_a90"):
+        succeeded_here(desk, "record", "plane", "flat", "--view", view, "--config", "cell.yaml")
+    lines = succeeded(desk, "calibrate", "noise", "flat", "--output", "noise-made")
+    file = desk / lines[0].strip()
+    document = read_document(file)
+    assert document.kind == "noise"
+    arguments = ("--part", "tube_fitting", "--recipe", "recipe.json", "--calibration", str(file))
+    succeeded_here(desk, "scan", *arguments, "--config", "cell.yaml", "--output", "scanned-with-noise")
+    report = json.loads((desk / "scanned-with-noise/report.json").read_text())
+    assert report["recipe"]["fusion"]["noise"] == document.model_dump()["noise"]
+
+
+def test_a_camera_that_repeats_itself_has_no_noise_to_measure(desk: Path) -> None:
+    succeeded_here(desk, "record", "repeats", "still", "--count", "5", "--config", "cell.yaml")
+    line = refused_here(desk, "calibrate", "noise", "still", "--repeats", "--output", "nothing-made")
+    assert "DEPTH_1.png: is the same as DEPTH_0.png to the last bit" in line
+
+
 @pytest.fixture(scope="module")
 def robi_response(desk: Path) -> Path:
     lines = succeeded_here(

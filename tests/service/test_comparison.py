@@ -246,7 +246,7 @@ def test_a_reference_without_true_depth_is_left_out_and_said_so(tmp_path: Path) 
 
 KEYS = {
     "object", "scene", "reference", "strategy", "refined", "seed", "views_added", "view", "completeness",
-    "poses", "missing_px", "predicted_gain_px", "measured_gain_px", "compute_s", "cell_s", "stage_s",
+    "poses", "depth", "missing_px", "predicted_gain_px", "measured_gain_px", "compute_s", "cell_s", "stage_s",
 }  # fmt: skip
 
 
@@ -294,6 +294,31 @@ def test_the_command_judges_poses_as_detected_and_refined(tmp_path: Path) -> Non
     assert refined["add_symmetric_m"] < 1e-3  # one disparity is 6.6 mm on these halved images
     for label in ("single view unrefined", "single view ", "nbv unrefined", "nbv "):
         assert label in done.stdout
+
+
+def test_the_command_judges_the_errors_of_the_depth_beside_the_sensor_s_own(tmp_path: Path) -> None:
+    asked = "--true-poses --depth --references 0 --views 2 --strategies nbv --json rows.json"
+    done = command(tmp_path, str(ROBI), *asked.split())
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert [row["views_added"] for row in rows] == [0, 1, 2]
+    assert (rows[0]["completeness"], rows[0]["depth"]["completed"]["pixels"]) == (0.0, 0)
+    for row in rows:
+        assert row["poses"] is None
+        depth = row["depth"]
+        for name in ("completed", "measured"):
+            assert depth[f"{name}_on_parts"]["pixels"] <= depth[name]["pixels"]
+        # on these halved images one disparity is 6.6 mm, and half a millimetre the median of what is measured there
+        assert 0 < depth["measured"]["median_m"] < depth["measured"]["p95_m"] < 2e-3
+    first, last = rows[1]["depth"], rows[2]["depth"]
+    assert 0 < first["completed_on_parts"]["pixels"] < last["completed_on_parts"]["pixels"]
+    assert 0 < last["completed"]["median_m"] < 1e-3
+    assert 0 <= last["completed"]["beyond"] < 0.1
+    # recovered are those of the completed on parts, doubtful ones too, that are not beyond 2 mm
+    recovered_px = rows[2]["completeness"] * rows[2]["missing_px"]
+    assert recovered_px >= last["completed_on_parts"]["pixels"] * (1 - last["completed_on_parts"]["beyond"]) - 0.5
+    for words in ("errors of the depth on the parts", "wherever the truth is known", "single view", "sens."):
+        assert words in done.stdout
 
 
 @pytest.mark.parametrize(

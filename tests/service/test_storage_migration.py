@@ -93,7 +93,8 @@ def test_scans_of_the_former_version_are_all_there(storage: Storage) -> None:
     assert done.recipe == REQUEST.recipe.model_dump(mode="json")
     assert done.setup is not None
     assert done.setup.model_dump(mode="json") == SETUP | {"repairs": []}
-    assert [view.model_dump(mode="json") for view in done.views] == [VIEW | {"poses": []}]
+    unknown_then = {"poses": [], "state_px": {}, "fused": None}
+    assert [view.model_dump(mode="json") for view in done.views] == [VIEW | unknown_then]
     artifacts = [(a.name, a.media_type, a.size_bytes, a.sha256) for a in done.artifacts]
     assert artifacts == list(ARTIFACTS)
     failed = storage.scan("failed")

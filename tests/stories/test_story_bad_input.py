@@ -410,7 +410,8 @@ def test_a_later_view_that_is_damaged_fails_the_scan_and_keeps_what_it_has(servi
     assert "truncated" in scan["problem"]["detail"]
     assert [view["view"] for view in scan["views"]] == ["view_4"]
     names = {artifact["name"] for artifact in scan["artifacts"]}
-    results = {"depth.png", "depth.npz", "cloud.ply", "poses.json", "poses.png", "picture.png", "report.json"}
+    results = {"depth.png", "sigma.png", "state.png", "depth.npz", "cloud.ply", "mesh.ply", "poses.json", "report.json"}
+    results |= {"poses.png", "picture.png"}
     assert names == {"view_00.npz"} | results
 
 

@@ -152,6 +152,7 @@ def test_what_is_no_calibration_is_not_found(service: ServiceProcess, path: str)
         ({"task": {"kind": "projector", "plane_k_d": True}}, 422, "plane_k_d"),
         ({"task": {"kind": "projector", "plane_k_d": 1.5}}, 422, "plane_k_d"),
         ({"task": {"kind": "sensing", "scene": -1}}, 422, "scene"),
+        ({"task": {"kind": "noise", "method": "guess"}}, 422, "method"),
         ({"colour": "red"}, 422, "colour"),
         ({"recipe": {"calibrations": ["../a"]}}, 422, "calibrations"),
         ({"recipe": {"calibrations": ["response-000000000000"]}}, 404, "response-000000000000"),

@@ -95,7 +95,8 @@ def test_the_views_and_the_results_are_all_there(service: ServiceProcess, ended:
     names = [artifact["name"] for artifact in ended["artifacts"]]
     views = ["view_00.npz", "view_01.npz", "view_02.npz"]
     pictures = ["picture.png", "poses.png", "reliability.png"]
-    assert names == [*views, "depth.png", "depth.npz", "cloud.ply", "poses.json", *pictures, "report.json"]
+    depth = ["depth.png", "sigma.png", "state.png", "depth.npz", "cloud.ply", "mesh.ply"]
+    assert names == [*views, *depth, "poses.json", *pictures, "report.json"]
     for artifact in ended["artifacts"]:
         assert len(read(service, ended, artifact["name"]).content) == artifact["size_bytes"]
 

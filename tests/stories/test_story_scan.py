@@ -6,12 +6,16 @@ import hashlib
 import io
 import itertools
 import json
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from service_process import QUICK_SCAN, ServiceProcess
+
+from sidelong_service.models import ViewReport
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +71,8 @@ def test_what_was_promised_of_each_view_stands_beside_what_it_gave(
 def test_files_have_the_checksums_and_sizes_that_are_listed(service: ServiceProcess, ended: dict[str, Any]) -> None:
     listed = service.http.get(f"/v1/scans/{ended['id']}/artifacts").json()["artifacts"]
     assert listed == ended["artifacts"]
-    names = {"depth.png", "depth.npz", "cloud.ply", "poses.json", "poses.png", "picture.png", "reliability.png"}
-    names |= {"report.json"}
+    names = {"depth.png", "sigma.png", "state.png", "depth.npz", "cloud.ply", "mesh.ply", "poses.json", "report.json"}
+    names |= {"poses.png", "picture.png", "reliability.png"}
     assert {artifact["name"] for artifact in listed} == names | {"view_00.npz", "view_01.npz", "view_02.npz"}
     for artifact in listed:
         answer = service.http.get(f"/v1/scans/{ended['id']}/artifacts/{artifact['name']}")
@@ -78,25 +82,72 @@ def test_files_have_the_checksums_and_sizes_that_are_listed(service: ServiceProc
         assert answer.headers["ETag"] == f'"{artifact["sha256"]}"'
 
 
-def test_png_and_npz_hold_the_same_depth(service: ServiceProcess, ended: dict[str, Any]) -> None:
+TRUSTED = ("measured", "completed")
+
+
+def in_states(arrays: Any, *names: str) -> Any:
+    """Return which pixels (H, W) of a ``depth.npz`` are in one of the states, by the names it brings along."""
+    return np.isin(arrays["states"][arrays["state"]], names)
+
+
+def pixels(service: ServiceProcess, scan: dict[str, Any], name: str) -> Any:
+    return cv2.imdecode(np.frombuffer(read(service, scan, name), np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_pictures_and_arrays_hold_the_same(service: ServiceProcess, ended: dict[str, Any]) -> None:
     arrays = np.load(io.BytesIO(read(service, ended, "depth.npz")))
     report = json.loads(read(service, ended, "report.json"))
-    picture = cv2.imdecode(np.frombuffer(read(service, ended, "depth.png"), np.uint8), cv2.IMREAD_UNCHANGED)
-    depth_m = arrays["depth_m"]
-    assert picture.dtype == np.uint16
-    assert picture.shape == depth_m.shape == (256, 320)
-    assert np.array_equal(picture == 0, np.isnan(depth_m) | arrays["doubtful"])
+    depth, sigma, state = (pixels(service, ended, name) for name in ("depth.png", "sigma.png", "state.png"))
+    depth_m, trusted = arrays["depth_m"], in_states(arrays, *TRUSTED)
+    assert (depth.dtype, sigma.dtype, state.dtype) == (np.uint16, np.uint16, np.uint8)
+    assert depth.shape == sigma.shape == state.shape == depth_m.shape == (256, 320)
+    assert np.array_equal(depth > 0, trusted)
     unit_m = report["depth_png"]["unit_m"]
-    np.testing.assert_allclose((picture * unit_m)[picture > 0], depth_m[picture > 0], atol=unit_m / 2 * 1.001)
-    assert np.array_equal(arrays["source"] < 0, np.isnan(depth_m))
-    assert set(np.unique(arrays["source"])) <= {-1, 0, 1, 2}
+    np.testing.assert_allclose((depth * unit_m)[trusted], depth_m[trusted], atol=unit_m / 2 * 1.001)
+    assert np.array_equal(sigma > 0, trusted)
+    unit_m = report["sigma_png"]["unit_m"]
+    np.testing.assert_allclose((sigma * unit_m)[trusted], arrays["sigma_m"][trusted], atol=unit_m / 2 * 1.001)
+    for name, value in report["state_png"].items():
+        assert np.array_equal(state == value, in_states(arrays, name))
+        assert report["state_px"][name] == int((state == value).sum())
+
+
+def test_each_pixel_says_what_its_depth_rests_on(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    arrays = np.load(io.BytesIO(read(service, ended, "depth.npz")))
+    measured, missing = in_states(arrays, "measured", "contradicted"), in_states(arrays, "missing")
+    assert np.array_equal(arrays["source"] == 0, measured)
+    assert np.array_equal(arrays["source"] < 0, missing)
+    assert np.array_equal(np.isnan(arrays["depth_m"]), missing)
+    assert np.array_equal(np.isnan(arrays["sigma_m"]), missing)
+    assert set(np.unique(arrays["source"])) == {-1, 0, 1, 2}
+    completed = in_states(arrays, "completed")
+    assert completed.sum() > 100
+    assert (arrays["sigma_m"][completed] > 0).all()
+
+
+def test_each_view_says_what_the_fusion_made_of_it(service: ServiceProcess, ended: dict[str, Any]) -> None:
+    views = ended["views"]
+    assert views[0]["fused"] is None
+    assert [view["fused"]["refused"] for view in views[1:]] == [None, None]
+    for before, after in itertools.pairwise(views):
+        fused, given, had = after["fused"], after["state_px"], before["state_px"]
+        assert sum(given.values()) == 256 * 320
+        assert fused["filled_px"] == had["missing"] - given["missing"]
+        assert given["measured"] + given["contradicted"] == had["measured"] + had["contradicted"]
+        assert fused["shared_points"] > 0
+        assert 0 <= fused["shift_m"] < 2e-3
+        assert 0 < fused["sigma_shift_m"] < 1e-3
+        assert 0.9 <= fused["agreement"] <= 1
+        view_file = np.load(io.BytesIO(read(service, ended, f"view_{after['index']:02d}.npz")))
+        moved_m = np.array(fused["base_T_camera"])[:3, 3] - view_file["base_T_camera"][:3, 3]
+        assert np.linalg.norm(moved_m) == pytest.approx(fused["shift_m"], abs=1e-9)
 
 
 def test_cloud_lies_where_depth_and_pose_say(service: ServiceProcess, ended: dict[str, Any]) -> None:
     arrays = np.load(io.BytesIO(read(service, ended, "depth.npz")))
     header, _, body = read(service, ended, "cloud.ply").partition(b"end_header\n")
-    vertices = np.frombuffer(body, dtype=[("point", "<f4", 3), ("colour", "u1", 3)])
-    rows, columns = np.nonzero(np.isfinite(arrays["depth_m"]) & ~arrays["doubtful"])
+    vertices = np.frombuffer(body, dtype=[("point", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
+    rows, columns = np.nonzero(in_states(arrays, *TRUSTED))
     assert f"element vertex {len(rows)}\n".encode() in header
     assert len(vertices) == len(rows)
     # back through the inverse pose and the intrinsics, each point lands on its own pixel, at its own depth
@@ -106,6 +157,26 @@ def test_cloud_lies_where_depth_and_pose_say(service: ServiceProcess, ended: dic
     np.testing.assert_allclose(points_camera[:, 2], arrays["depth_m"][rows, columns], atol=1e-6)
     np.testing.assert_allclose(projected[:, 0] / projected[:, 2], columns, atol=1e-3)
     np.testing.assert_allclose(projected[:, 1] / projected[:, 2], rows, atol=1e-3)
+    # normals turn to the camera, and most of what it sees from above lies flat
+    normals_camera = vertices["normal"] @ base_T_camera[:3, :3]
+    np.testing.assert_allclose(np.linalg.norm(normals_camera, axis=1), 1.0, atol=1e-5)
+    assert ((normals_camera * points_camera).sum(axis=1) < 0).all()
+    assert np.median(vertices["normal"][:, 2]) > 0.9
+
+
+def test_mesh_is_read_by_another_program_and_bridges_no_edge(
+    service: ServiceProcess, ended: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "mesh.ply").write_bytes(read(service, ended, "mesh.ply"))
+    mesh: Any = trimesh.load(tmp_path / "mesh.ply", process=False)
+    report = json.loads(read(service, ended, "report.json"))
+    assert (len(mesh.vertices), len(mesh.faces)) == (report["mesh_ply"]["points"], report["mesh_ply"]["triangles"])
+    assert len(mesh.vertices) > 0.9 * report["cloud_ply"]["points"]
+    base_T_camera = np.array(report["base_T_camera"])
+    eye_m = base_T_camera[:3, 3]
+    towards = eye_m - mesh.triangles_center
+    cosines = (mesh.face_normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    assert cosines.min() > np.cos(1.31)
 
 
 def test_what_the_reference_view_measured_is_in_the_result_to_the_bit(
@@ -156,7 +227,7 @@ def test_the_overlay_shows_the_poses_in_colour(service: ServiceProcess, ended: d
 
 def test_picture_is_a_picture(service: ServiceProcess, ended: dict[str, Any]) -> None:
     picture = cv2.imdecode(np.frombuffer(read(service, ended, "picture.png"), np.uint8), cv2.IMREAD_COLOR)
-    assert picture.shape[1] == 1300
+    assert picture.shape[1] == 1800
     assert picture.std() > 20
 
 
@@ -188,7 +259,8 @@ def test_events_tell_the_whole_course_and_can_be_replayed(service: ServiceProces
     assert ids == sorted(set(ids))
     states = [event.data["state"] for event in events if event.kind == "state"]
     assert states == ["accepted", "running", "succeeded"]
-    assert [event.data for event in events if event.kind == "view"] == ended["views"]
+    views = [ViewReport.model_validate(event.data) for event in events if event.kind == "view"]
+    assert [view.model_dump(mode="json") for view in views] == ended["views"]
     phases = [event.data["phase"] for event in events if event.kind == "phase"]
     assert phases[:4] == ["move", "capture", "capture", "detect"]
     for cut in (0, len(events) // 2, len(events) - 1):

@@ -4,30 +4,28 @@ On a plane 1/z is affine in the image, and the depth noise of a stereo pair, whi
 in 1/z. So the plain least-squares plane of 1/z is the best for such noise, and it takes ten small filters of the image
 instead of a search for neighbours and an eigenproblem per pixel.
 
-A window across a depth edge gives a normal of neither side. Edges are taken out before any fit: steps between
-neighbours that fit neither the step before nor the one after. A steep slope and a crease are no edges; a limit on the
-step alone could not tell a slope of 80 degrees from a jump of 4 mm (at 0.7 m). What this misses, creases and jumps
-across holes, leaves a large residual and is dropped after the fit.
+A window across a depth edge gives a normal of neither side. Edges are taken out before any fit
+(:mod:`sidelong.geometry.depth_edges`). What this misses, creases and jumps across holes, leaves a large residual and is
+dropped after the fit.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from sidelong.calibration.depth_noise import noise_blur_px
+from sidelong.calibration.depth_noise.blur import noise_blur_px
 from sidelong.calibration.window_planes import PLANE_PARAMETERS, Method, Planes, fit_planes
 from sidelong.errors import DepthError, ImageError, SettingsError
 from sidelong.geometry.camera_model import PinholeCamera
+from sidelong.geometry.depth_edges import depth_jumps, neighbours, typical
 from sidelong.types import BoolArray, FloatArray, IntArray
 
-EDGE_NOISE = 8.0
-"""A step is an edge only if it is also this many times as odd as the median step: noise alone takes 1 step in 6,000."""
 RESIDUAL_NOISE = 2.0
-"""As ``EDGE_NOISE`` for residuals; with 5x5 points noise scatters them by 15 %."""
+"""As :data:`~sidelong.geometry.depth_edges.EDGE_NOISE` for residuals; with 5x5 points noise scatters them by 15 %."""
 SMOOTHED_SIGMA = 3.0
 """Error over sigma per pixel of smoothing, where noise is taken as independent: 2.9 to 3.3 times the blur, measured for
 blurs of 0.7 to 2 px and windows of 3 to 9 px."""
@@ -200,8 +198,8 @@ def _near_edges(inverse: FloatArray, camera: PinholeCamera, settings: NormalSett
     edges = np.zeros(inverse.shape, dtype=np.bool_)
     inverse32 = inverse.astype(np.float32)  # its digits are 1e-4 of the smallest step that matters
     for axis, focal_px in ((1, camera.fx), (0, camera.fy)):
-        jumps = _jumps(inverse32, axis, settings.edge_step / focal_px)
-        for side in _neighbours(edges, axis):
+        jumps = depth_jumps(inverse32, axis, settings.edge_step / focal_px)
+        for side in neighbours(edges, axis):
             side |= jumps
     # both pixels of a jump are marked. With radius r, a margin of (r - 1) // 2 keeps centres so far from a straight
     # jump along rows or columns that what their windows hold beyond it is marked, too. Corners beyond an oblique one
@@ -211,35 +209,9 @@ def _near_edges(inverse: FloatArray, camera: PinholeCamera, settings: NormalSett
     return np.asarray(cv2.dilate(edges.view(np.uint8), square)).astype(np.bool_)
 
 
-def _jumps(inverse: Any, axis: int, step: float) -> BoolArray:
-    """Say between which neighbours along an axis depth jumps by more than ``step`` of itself."""
-    before, after = _neighbours(inverse, axis)
-    steps = after - before
-    bend_before, bend_after = _neighbours(steps, axis)
-    bend = np.abs(bend_after - bend_before)
-    # how odd a step is against the neighbouring step that is more like it; NaN where neither is known
-    odd = np.full_like(steps, np.nan)
-    with_next, with_last = _neighbours(odd, axis)
-    with_last[...] = bend
-    np.fmin(with_next, bend, out=with_next)
-    return odd > np.maximum(step * np.minimum(before, after), EDGE_NOISE * _typical(odd))
-
-
-def _neighbours(image: Any, axis: int) -> tuple[Any, Any]:
-    """Return two views along an axis: without the last pixel, and without the first."""
-    return (image[:-1], image[1:]) if axis == 0 else (image[:, :-1], image[:, 1:])
-
-
-def _typical(values: Any) -> float:
-    """Return the median of what is known in every eighth row, 0 where nothing is."""
-    some = values[::8]
-    known = some[np.isfinite(some)]
-    return float(np.median(known)) if known.size else 0.0
-
-
 def _judged(planes: Planes, inverse: FloatArray, camera: PinholeCamera, settings: NormalSettings) -> NormalMap:
     """Drop the windows that do not lie on a plane."""
-    noise = _typical(planes.rms)
+    noise = typical(planes.rms)
     largest = settings.max_residual * settings.radius_px / camera.fx * inverse
     keep = np.where(planes.rms <= np.maximum(largest, RESIDUAL_NOISE * noise), 1.0, np.nan)
     # into the same arrays: fresh ones of this size cost as much time as arithmetic on them

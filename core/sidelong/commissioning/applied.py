@@ -11,6 +11,7 @@ from sidelong.commissioning.documents import (
     Document,
     HandEyeDocument,
     MaterialDocument,
+    NoiseDocument,
     ProjectorDocument,
     ResponseDocument,
     SensingDocument,
@@ -54,8 +55,12 @@ def calibrated(recipe: Recipe, documents: Sequence[Document], device_serial: str
     curve = _the(documents, SensingDocument)
     if curve is not None:
         sensing = sensing.model_copy(update={"curve": curve.curve})
+    fusion = recipe.fusion
+    noise = _the(documents, NoiseDocument)
+    if noise is not None:
+        fusion = fusion.model_copy(update={"noise": noise.noise})
     names = tuple(document.id for document in documents)
-    return recipe.model_copy(update={"light": light, "sensing": sensing, "calibrations": names})
+    return recipe.model_copy(update={"light": light, "sensing": sensing, "fusion": fusion, "calibrations": names})
 
 
 def calibrated_mount(flange_T_camera: FloatArray, documents: Sequence[Document]) -> FloatArray:

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from sidelong.errors import CalibrationError
+from sidelong.physics.depth_noise import DepthNoise
 from sidelong.physics.response import LEVELS
 from sidelong.physics.sensing import SensingCurve
 
@@ -170,8 +171,20 @@ class HandEyeDocument(_Document):
     rotation_error_rad: Triple = Field(description="standard errors about the flange's axes")
 
 
+class NoiseDocument(_Document):
+    """Noise of depth: errors on a flat plate, or what differs between repeated shots, which is a lower bound."""
+
+    kind: Literal["noise"] = "noise"
+    method: Literal["plate", "repeats"]
+    noise: DepthNoise = Field(description="numbers to use: defaults stand in for what was not identified")
+    parameters: dict[str, Parameter] = Field(description="each of them as it was estimated")
+    image_px: tuple[int, int] = Field(strict=False, description="width and height: noise is in pixels of this image")
+    captures: int
+    pixels: int
+
+
 Document: TypeAlias = Annotated[
-    ResponseDocument | ProjectorDocument | MaterialDocument | SensingDocument | HandEyeDocument,
+    ResponseDocument | ProjectorDocument | MaterialDocument | SensingDocument | HandEyeDocument | NoiseDocument,
     Field(discriminator="kind"),
 ]
 DOCUMENT: TypeAdapter[Document] = TypeAdapter(Document)

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sidelong.commissioning.made import Captures, Made, Progress
-from sidelong.commissioning.tasks import HandEyeTask, MaterialTask, ProjectorTask, ResponseTask, SensingTask, Task
+from sidelong.commissioning.tasks import (
+    HandEyeTask,
+    MaterialTask,
+    NoiseTask,
+    ProjectorTask,
+    ResponseTask,
+    SensingTask,
+    Task,
+)
 
 
 def perform(task: Task, captures: Captures, progress: Progress) -> Iterator[Made]:
@@ -48,3 +56,7 @@ def perform(task: Task, captures: Captures, progress: Progress) -> Iterator[Made
             from sidelong.commissioning.hand_eye import make_hand_eye
 
             yield make_hand_eye(task, captures, progress)
+        case NoiseTask():
+            from sidelong.commissioning.noise import make_noise
+
+            yield make_noise(task, captures, progress)

@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from sidelong.devices import Camera, CaptureRequest
 from sidelong.errors import DatasetError, DepthError
 from sidelong.recorded.files import MM
 from sidelong.recorded.writing import add_to_json, pose_to_mm, write_depth, write_gray, write_json, write_rig
-from sidelong.types import FloatArray, Frame, Projector
+from sidelong.types import Float32Array, FloatArray, Frame, Projector
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,7 @@ class Recorder:
     def sprayed(self, exposure_s: float) -> tuple[Path, ...]:
         """Take the depth of the scene once it is sprayed, and return its file. Raises as ``bracket``."""
         frame, file = self._depth_frame(exposure_s), self._folder("Phong") / "DEPTH_sprayed.png"
-        self._write_depth(file, frame)
+        write_depth(file, self._depth_of(frame))
         write_json(file.with_suffix(".json"), self._about(frame))
         return (file,)
 
@@ -98,10 +100,28 @@ class Recorder:
         folder = self._folder("Plane")
         index = _next_index(folder, "LEFT_white_")
         picture = folder / f"DEPTH_{index}.png"
-        self._write_depth(picture, depth)
+        write_depth(picture, self._depth_of(depth))
         # the white image last: by it captures are known
         room = self._write_images(folder, f"off_{index}", dark)
         return (picture, *room, *self._write_images(folder, f"white_{index}", lit))
+
+    def repeats(self, exposure_s: float, count: int, progress: Callable[[int, int], None]) -> tuple[Path, ...]:
+        """Take the depth of a scene at rest again and again, and return the files; older ones give way.
+
+        Raises as ``bracket``.
+        """
+        maps: list[Float32Array] = []
+        for done in range(count):
+            progress(done, count)
+            # images of dozens of shots are much to hold
+            maps.append(self._depth_of(self._depth_frame(exposure_s)).astype(np.float32))
+        folder = self._folder("Repeats")
+        for old in folder.glob("DEPTH_*.png"):
+            old.unlink()
+        files = tuple(folder / f"DEPTH_{index}.png" for index in range(count))
+        for file, depth_m in zip(files, maps, strict=True):
+            write_depth(file, depth_m.astype(np.float64))
+        return files
 
     def board(self, exposure_s: float, projector: Projector) -> tuple[Path, ...]:
         """Take an image of the board beside those that are there, keep the arm's pose, and return the file.
@@ -123,10 +143,10 @@ class Recorder:
     def _depth_frame(self, exposure_s: float) -> Frame:
         return self._frame(Projector.DOTS, exposure_s, depth=True)
 
-    def _write_depth(self, file: Path, frame: Frame) -> None:
+    def _depth_of(self, frame: Frame) -> FloatArray:
         if frame.depth_m is None:
             raise DepthError(f"{self.camera.name}: gave no depth map")
-        write_depth(file, frame.depth_m)
+        return frame.depth_m
 
     def _write_images(self, folder: Path, name: str, frame: Frame) -> tuple[Path, ...]:
         images = {"LEFT": frame.left} | ({"RIGHT": frame.right} if frame.right is not None else {})

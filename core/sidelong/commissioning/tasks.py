@@ -47,7 +47,14 @@ class HandEyeTask(_Task):
     arm: Name | None = Field(default=None, description="model of the arm, for the file")
 
 
+class NoiseTask(_Task):
+    """Noise of depth, from captures of a flat plate, or, as a lower bound, from repeated shots of any scene."""
+
+    kind: Literal["noise"] = "noise"
+    method: Literal["plate", "repeats"] = "plate"
+
+
 Task: TypeAlias = Annotated[
-    ResponseTask | ProjectorTask | MaterialTask | SensingTask | HandEyeTask, Field(discriminator="kind")
+    ResponseTask | ProjectorTask | MaterialTask | SensingTask | HandEyeTask | NoiseTask, Field(discriminator="kind")
 ]
 TASK: TypeAdapter[Task] = TypeAdapter(Task)

@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict
 
 from sidelong.devices import CaptureRequest, Cell
 from sidelong.evaluation.cases import Case
-from sidelong.evaluation.metrics import Truth
+from sidelong.evaluation.depth_score import DepthScore, score_depth
+from sidelong.evaluation.metrics import Truth, seen_m
 from sidelong.evaluation.pose_score import PoseJudge, PoseScore
 from sidelong.planning.selection import StrategyName, strategy_of
 from sidelong.recipe import AsDetected, GivenObjects, Recipe, Stages
@@ -38,6 +39,7 @@ class Row(BaseModel):
     view: str | None
     """None where the run had ended before: the numbers stay as they were."""
     completeness: float
+    """Of depth that some view measured, the doubtful included: the error decides, not the mark."""
     missing_px: int
     predicted_gain_px: float
     measured_gain_px: float
@@ -49,6 +51,8 @@ class Row(BaseModel):
     """Seconds in each stage since the start of the run, as measured on the recorded views."""
     poses: PoseScore | None = None
     """Of the objects after this view, where they are judged."""
+    depth: DepthScore | None = None
+    """Errors of the depth after this view, where it is judged."""
 
 
 @dataclass(frozen=True)
@@ -70,10 +74,19 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Yardstick:
-    """What one reference view is measured by: true depth, and true poses if they are to be judged."""
+    """What one reference view is measured by: true depth, and true poses if they are to be judged.
+
+    With ``depth`` the errors of the depth are judged as well, beyond how much of it is recovered.
+    """
 
     truth: Truth
     judge: PoseJudge | None = None
+    depth: bool = False
+
+    @property
+    def judges_reference(self) -> bool:
+        """Whether there is something to be said of the reference view alone."""
+        return self.judge is not None or self.depth
 
 
 def compare_reference(
@@ -85,8 +98,8 @@ def compare_reference(
     runs: Sequence[Run],
     time: CellTime = CellTime(),
 ) -> Iterator[Row]:
-    """Run each strategy from one reference view and yield a row for each view added; before them, where poses are
-    judged, one for the reference view alone.
+    """Run each strategy from one reference view and yield a row for each view added; before them, where poses or depth
+    errors are judged, one for the reference view alone.
 
     The image of the reference view is the same for all, so detection runs once and each run is charged for it.
     Thresholds of the gain are set aside: every run takes ``recipe.planning.max_views`` views if it can.
@@ -139,7 +152,7 @@ def _rows(
             seed=run.seed,
             views_added=step.index,
             view=step.view.name,
-            completeness=truth.completeness(step.depth_m),
+            completeness=truth.completeness(seen_m(step.depth)),
             missing_px=int(truth.missing.sum()),
             predicted_gain_px=step.predicted_gain_px,
             measured_gain_px=step.measured_gain_px,
@@ -147,8 +160,9 @@ def _rows(
             cell_s=compute_s + (step.index + 1) * time.capture_s + step.index * time.move_s,
             stage_s=dict(stage_s),
             poses=None if judge is None else judge.score(step.objects),
+            depth=score_depth(step.depth, truth) if yardstick.depth else None,
         )
-        if step.index > 0 or judge is not None:
+        if step.index > 0 or yardstick.judges_reference:
             yield row
     if row is not None:
         for index in range(row.views_added + 1, max_views + 1):

@@ -12,7 +12,7 @@ from sidelong.errors import DepthError
 from sidelong.geometry.camera_model import PinholeCamera
 from sidelong.geometry.mesh import Part
 from sidelong.geometry.raycast import RayScene
-from sidelong.types import BoolArray, FloatArray
+from sidelong.types import BoolArray, CompletedDepth, FloatArray, PixelState
 
 RECOVERED_WITHIN_M = 2e-3
 """Largest depth error of a recovered pixel (paper, section V-B)."""
@@ -55,7 +55,10 @@ class Truth:
         return missing
 
     def recovered(self, depth_m: FloatArray) -> BoolArray:
-        """Return which missing pixels (H, W) now lie within ``RECOVERED_WITHIN_M`` of the truth."""
+        """Return which missing pixels (H, W) now lie within ``RECOVERED_WITHIN_M`` of the truth.
+
+        Doubtful depth counts as well: here the error decides.
+        """
         error_m = np.abs(np.where(np.isfinite(depth_m), depth_m, np.inf) - np.nan_to_num(self.depth_m))
         return self.missing & (error_m < RECOVERED_WITHIN_M)
 
@@ -85,3 +88,8 @@ def truth_of(
     """
     rendered_m = RayScene(parts).render(*seen_from).depth_m
     return Truth(depth_m, np.abs(rendered_m - depth_m) <= ON_PART_WITHIN_M, measured)
+
+
+def seen_m(depth: CompletedDepth) -> FloatArray:
+    """Return the depth (H, W) that some view measured, also where it is doubtful; NaN where a CAD model stands in."""
+    return np.where(depth.state == PixelState.MODELLED, np.nan, depth.depth_m)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sidelong.evaluation.compare import Row
+from sidelong.evaluation.depth_score import DepthErrors
 from sidelong.planning.selection import StrategyName
 
 
@@ -71,6 +73,28 @@ class PosePoint:
     compute_s: float
 
 
+@dataclass(frozen=True)
+class DepthPoint:
+    """Errors of the depth of a strategy after some views, over all references (and seeds).
+
+    Attributes
+    ----------
+    label
+        Of the strategy; views_added 0 is the reference view alone.
+    on_parts
+        Whether of the pixels on parts only.
+    completed, measured
+        Of what further views gave and of what the reference view measured itself: pixels are the mean number, all else
+        means weighted by it.
+    """
+
+    label: str
+    views_added: int
+    on_parts: bool
+    completed: DepthErrors
+    measured: DepthErrors
+
+
 def label_of(name: str, refined: bool) -> str:
     """Return what a strategy is called in tables and plots."""
     return name if refined else f"{name} unrefined"
@@ -103,13 +127,10 @@ def summarise_poses(rows: Sequence[Row]) -> list[PosePoint]:
     The reference view alone is the same for all strategies and listed once for refined and unrefined poses each.
     """
     points: list[PosePoint] = []
-    alone: set[bool] = set()
-    for (strategy, refined, views_added), mine in _groups(rows):
+    for label, views_added, mine in _judged(rows):
         scores = [row.poses for row in mine if row.poses is not None]
-        if not scores or (views_added == 0 and refined in alone):
+        if not scores:
             continue
-        if views_added == 0:
-            alone.add(refined)
         detected, correct, symmetric, visible, found = (
             sum(getattr(score, name) for score in scores)
             for name in ("detected", "correct", "correct_symmetric", "visible", "found")
@@ -124,7 +145,7 @@ def summarise_poses(rows: Sequence[Row]) -> list[PosePoint]:
         }
         points.append(
             PosePoint(
-                label=label_of(strategy.value if views_added else "single view", refined),
+                label=label,
                 views_added=views_added,
                 rate=_share(correct, detected),
                 rate_symmetric=_share(symmetric, detected),
@@ -136,7 +157,43 @@ def summarise_poses(rows: Sequence[Row]) -> list[PosePoint]:
     return points
 
 
+def summarise_depth(rows: Sequence[Row]) -> list[DepthPoint]:
+    """Return two points, on parts and everywhere, for each strategy and number of views whose depth was judged.
+
+    The reference view alone is listed as in :func:`summarise_poses`.
+    """
+    points: list[DepthPoint] = []
+    for label, views_added, mine in _judged(rows):
+        scores = [row.depth for row in mine if row.depth is not None]
+        if not scores:
+            continue
+        on_parts = [s.completed_on_parts for s in scores], [s.measured_on_parts for s in scores]
+        everywhere = [s.completed for s in scores], [s.measured for s in scores]
+        for where, (completed, measured) in ((True, on_parts), (False, everywhere)):
+            points.append(DepthPoint(label, views_added, where, _pooled(completed), _pooled(measured)))
+    return points
+
+
+def _pooled(errors: Sequence[DepthErrors]) -> DepthErrors:
+    """Return the mean number of pixels, and the means of all else weighted by their numbers."""
+    names = [name for name in DepthErrors.model_fields if name != "pixels"]
+    means = {name: _mean([(getattr(each, name), each.pixels) for each in errors]) for name in names}
+    known = {name: None if math.isnan(value) else value for name, value in means.items()}
+    return DepthErrors(pixels=round(float(np.mean([each.pixels for each in errors]))), **known)
+
+
 Key = tuple[StrategyName, bool, int]
+
+
+def _judged(rows: Sequence[Row]) -> Iterator[tuple[str, int, list[Row]]]:
+    """Yield label, number of views and rows of each strategy; the reference view alone, once for each kind of poses."""
+    alone: set[bool] = set()
+    for (strategy, refined, views_added), mine in _groups(rows):
+        if views_added > 0:
+            yield label_of(strategy.value, refined), views_added, mine
+        elif refined not in alone:
+            alone.add(refined)
+            yield label_of("single view", refined), 0, mine
 
 
 def _groups(rows: Sequence[Row]) -> list[tuple[Key, list[Row]]]:

@@ -12,6 +12,7 @@
            /mask_parts.png, GT_world2obj.json       optional: which pixels show parts; their poses (mm)
       Plane/LEFT_white_<i>.bmp .json, DEPTH_<i>.png matte plane under the white pattern, and its depth
            /LEFT_off_<i>.bmp .json                  optional: projector off
+      Repeats/DEPTH_<i>.png                         depth of a scene at rest, again and again
       HandEye/board.json, poses.json, images        ChArUco board: {"unit": "mm", "poses": {image: base_T_flange}}
 """
 

@@ -10,6 +10,7 @@ from sidelong.commissioning.documents import (
     HandEyeDocument,
     LightUsed,
     MaterialDocument,
+    NoiseDocument,
     Parameter,
     PoseResidual,
     ProjectorDocument,
@@ -17,6 +18,7 @@ from sidelong.commissioning.documents import (
     Scores,
     SensingDocument,
 )
+from sidelong.physics.depth_noise import DepthNoise
 from sidelong.physics.response import Response
 from sidelong.physics.sensing import SensingCurve
 
@@ -63,6 +65,14 @@ def sensing_document(**changes: Any) -> SensingDocument:
         "exponential_scores": Scores(log_loss=0.7, brier=0.2, expected_calibration_error=0.2),
     }  # fmt: skip
     return SensingDocument(**(values | changes)).sealed()
+
+
+def noise_document(**changes: Any) -> NoiseDocument:
+    values: dict[str, Any] = {
+        "device_serial": SERIAL, "inputs": (), "method": "plate", "noise": DepthNoise(disparity_px=0.11, slope_px=0.3),
+        "parameters": {"disparity_px": SURE}, "image_px": (1280, 1024), "captures": 5, "pixels": 100_000,
+    }  # fmt: skip
+    return NoiseDocument(**(values | changes)).sealed()
 
 
 def hand_eye_document(**changes: Any) -> HandEyeDocument:

@@ -8,6 +8,7 @@ from calibration_examples import (
     SERIAL,
     hand_eye_document,
     material_document,
+    noise_document,
     projector_document,
     response_document,
     sensing_document,
@@ -57,6 +58,17 @@ def test_under_another_intensity_only_the_product_stays() -> None:
     assert material.k_d * 200.0 == pytest.approx(0.5 * 300.0)
     assert material.k_s * 200.0 == pytest.approx(0.5 * 300.0)
     assert material.n == 0.5
+
+
+def test_noise_goes_to_the_fusion_and_stands_by_itself() -> None:
+    document = noise_document()
+    recipe = calibrated(RECIPE, [document], SERIAL)
+    assert recipe.fusion.noise == document.noise
+    assert recipe.fusion.model_copy(update={"noise": RECIPE.fusion.noise}) == RECIPE.fusion
+    assert recipe.light == RECIPE.light
+    assert calibrated(RECIPE, [document, sensing_document()], SERIAL).fusion == recipe.fusion
+    with pytest.raises(CalibrationError, match="are both of noise: name one of them"):
+        calibrated(RECIPE, [document, noise_document(method="repeats")], SERIAL)
 
 
 def test_materials_do_not_push_out_others() -> None:

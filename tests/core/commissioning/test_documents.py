@@ -11,6 +11,7 @@ import pytest
 from calibration_examples import (
     hand_eye_document,
     material_document,
+    noise_document,
     projector_document,
     response_document,
     sensing_document,
@@ -21,6 +22,7 @@ from sidelong.errors import CalibrationError
 
 MAKERS: tuple[Callable[..., Document], ...] = (
     response_document, projector_document, material_document, sensing_document, hand_eye_document,
+    noise_document,
 )  # fmt: skip
 kinds = pytest.mark.parametrize("make", MAKERS)
 

@@ -46,6 +46,7 @@ from sidelong.commissioning.documents import (
     Document,
     HandEyeDocument,
     MaterialDocument,
+    NoiseDocument,
     ProjectorDocument,
     ResponseDocument,
     SensingDocument,
@@ -54,7 +55,15 @@ from sidelong.commissioning.documents import (
 )
 from sidelong.commissioning.made import Captures, Made
 from sidelong.commissioning.procedures import perform
-from sidelong.commissioning.tasks import HandEyeTask, MaterialTask, ProjectorTask, ResponseTask, SensingTask, Task
+from sidelong.commissioning.tasks import (
+    HandEyeTask,
+    MaterialTask,
+    NoiseTask,
+    ProjectorTask,
+    ResponseTask,
+    SensingTask,
+    Task,
+)
 from sidelong.devices import CaptureRequest, Cell
 from sidelong.errors import CalibrationError, DatasetError, ImageError, InputError, PoseError, UnknownNameError
 from sidelong.evaluation.cases import true_objects
@@ -137,6 +146,7 @@ def examples(bench: Path, boards: Path) -> dict[str, Example]:
         "projector": projector,
         "material": Example.of(MaterialTask(), bench, "two", light),
         "hand_eye": Example.of(HandEyeTask(arm="ur10e"), boards),
+        "noise": Example.of(NoiseTask(), bench),
         "sensing": recorded[2],
         "robi response": recorded[0],
         "robi material": recorded[1],
@@ -601,13 +611,89 @@ def test_a_camera_far_off_the_flange_is_refused(tmp_path: Path) -> None:
         made_from(tmp_path, HandEyeTask())
 
 
+# --- noise ---
+
+
+def test_the_planes_of_the_projector_give_the_noise_of_depth(examples: dict[str, Example], bench: Path) -> None:
+    document = examples["noise"].made[0].document
+    assert isinstance(document, NoiseDocument)
+    found = document.parameters["disparity_px"]
+    assert found.identifiable
+    assert document.noise.disparity_px == found.value
+    camera = BenchCamera([(floor(), np.eye(4))])
+    pose = looking_down(0.62, 0.1)
+    depth_m = camera.capture(CaptureRequest(Projector.DOTS, 0.01, depth=True), pose).depth_m
+    assert depth_m is not None
+    ratio = (depth_m - camera.capture_truth(pose)) / document.noise.sigma_m(depth_m, camera.rig)
+    assert 0.8 < np.nanstd(ratio) < 1.25
+    assert {each.name for each in document.inputs} == {f"Calibration/Plane/DEPTH_{index}.png" for index in range(3)}
+    assert (document.method, document.captures, document.image_px) == ("plate", len(PLANES), (320, 256))
+    recipe = calibrated(Recipe(), [document], SERIAL)
+    assert recipe.fusion.noise == document.noise
+
+
+class NoisyCamera(BenchCamera):
+    """Shows a wall whose depth is off by something else each time."""
+
+    def __init__(self) -> None:
+        super().__init__([(floor(), np.eye(4))])
+        self._random = np.random.default_rng(8)
+
+    def capture(self, request: CaptureRequest, base_T_camera: FloatArray) -> Frame:
+        grey = np.full((256, 320), 90, dtype=np.uint8)
+        depth_m = 0.6 + 0.5e-3 * self._random.normal(size=(256, 320))
+        return Frame(View("wall", base_T_camera), grey, grey, depth_m, request.projector, request.exposure_s)
+
+
+def test_repeated_shots_give_a_lower_bound_and_say_so(tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    taking = recorder(NoisyCamera(), tmp_path, None)
+    taking.repeats(0.01, 9, lambda done, total: None)
+    files = taking.repeats(0.01, 6, lambda done, total: told.append((done, total)))
+    assert told == [(done, 6) for done in range(6)]
+    assert sorted(file.name for file in (tmp_path / "Calibration/Repeats").iterdir()) == [file.name for file in files]
+    (made,) = made_from(tmp_path, NoiseTask(method="repeats"))
+    document = made.document
+    assert isinstance(document, NoiseDocument)
+    assert (document.method, document.captures) == ("repeats", 6)
+    rig = BenchCamera([(floor(), np.eye(4))]).rig
+    expected_px = 0.5e-3 * rig.left.fx * rig.baseline_m / 0.6**2
+    found = document.parameters["disparity_px"]
+    assert found.low < expected_px < found.high
+    assert any("a lower bound" in warning for warning in document.warnings)
+
+
+@pytest.mark.parametrize(
+    ("edit", "kind", "message"),
+    [
+        (lambda folder: [file.unlink() for file in folder.glob("DEPTH_*")], DatasetError, r"has no DEPTH_<i>\.png"),
+        (shutil.rmtree, DatasetError, r"Plane: no such folder of captures"),
+        (lambda folder: shutil.copyfile(folder / "DEPTH_0.png", folder / "DEPTH_2.png"), CalibrationError,
+         r"DEPTH_2\.png: is the same as DEPTH_0\.png to the last bit"),
+        (lambda folder: Image.fromarray(np.zeros((256, 320), np.uint16)).save(folder / "DEPTH_1.png"),
+         CalibrationError, r"DEPTH_1\.png: 0 of 81920 px are measured, needs 2000"),
+        (lambda folder: Image.fromarray(np.full((256, 320), 22400, np.uint16)).save(folder / "DEPTH_1.png"),
+         CalibrationError, r"DEPTH_1\.png: the depth of its flat surface has no noise"),
+        (lambda folder: (folder / "DEPTH_1.png").write_bytes(b"no picture"), ImageError, r"DEPTH_1\.png"),
+    ],
+)  # fmt: skip
+def test_depth_maps_that_carry_no_noise_are_refused(
+    bench: Path, tmp_path: Path, edit: Edit, kind: type[InputError], message: str
+) -> None:
+    root = copied(bench, tmp_path)
+    edit(root / "Calibration/Plane")
+    with pytest.raises(kind, match=message):
+        made_from(root, NoiseTask())
+
+
 # --- what all of them share ---
 
 
-KINDS = pytest.mark.parametrize("kind", ["response", "projector", "material", "sensing", "hand_eye"])
+KINDS = pytest.mark.parametrize("kind", ["response", "projector", "material", "sensing", "hand_eye", "noise"])
 WORKS = {
     "response": ("response",), "projector": ("projector",), "material": ("samples", "materials"),
     "sensing": ("views",), "hand_eye": ("images of the board",),
+    "noise": ("depth maps",),
 }  # fmt: skip
 
 
@@ -891,6 +977,13 @@ def test_a_white_image_of_the_recorded_scene_that_was_moved_is_refused(tmp_path:
         (SensingTask(), "two", UnknownNameError, r"object 'two' is unknown, known are none"),
         (ResponseTask(), "two", None, ""),  # the device's own bracket serves all objects
         (HandEyeTask(), None, DatasetError, r"HandEye: no such folder of captures"),
+        (
+            NoiseTask(method="repeats"),
+            "two",
+            DatasetError,
+            r"two.Calibration.Repeats and .*: no such folder of captures",
+        ),
+        (NoiseTask(), "two", None, ""),
     ],
 )
 def test_what_is_not_recorded_is_refused_by_name(

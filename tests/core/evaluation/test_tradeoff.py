@@ -11,8 +11,9 @@ import pytest
 from PIL import Image
 
 from sidelong.evaluation.compare import Row
+from sidelong.evaluation.depth_score import DepthErrors, DepthScore
 from sidelong.evaluation.pose_score import PoseScore
-from sidelong.evaluation.tradeoff import Point, draw, summarise, summarise_poses
+from sidelong.evaluation.tradeoff import Point, draw, summarise, summarise_depth, summarise_poses
 from sidelong.planning.selection import StrategyName
 
 NBV, RANDOM, FAR = StrategyName.NBV, StrategyName.RANDOM, StrategyName.MAX_DISTANCE
@@ -126,8 +127,48 @@ def test_where_nothing_was_detected_or_judged_there_is_no_number() -> None:
     assert summarise_poses([row(NBV, "a", 0.5)]) == []
 
 
+def with_errors(strategy: StrategyName, views_added: int, pixels: int, median_m: float | None) -> Row:
+    """A row whose depth was judged: so many completed pixels, a tenth of them on parts, half as many measured."""
+
+    def errors(count: int) -> DepthErrors:
+        return (
+            DepthErrors(pixels=count) if median_m is None else DepthErrors(pixels=count, median_m=median_m, beyond=0.1)
+        )
+
+    depth = DepthScore(
+        completed_on_parts=errors(pixels // 10), completed=errors(pixels),
+        measured_on_parts=errors(pixels // 20), measured=errors(pixels // 2),
+    )  # fmt: skip
+    return row(strategy, "a", 0.5, views_added=views_added).model_copy(update={"depth": depth})
+
+
+def test_errors_of_depth_are_weighted_by_pixels_on_parts_and_everywhere() -> None:
+    """1 mm of 3000 pixels and 5 mm of 1000 are 2 mm; 2000 pixels is their mean number."""
+    on_parts, everywhere = summarise_depth([with_errors(NBV, 1, 3000, 1e-3), with_errors(NBV, 1, 1000, 5e-3)])
+    assert (on_parts.label, on_parts.views_added, on_parts.on_parts, everywhere.on_parts) == ("nbv", 1, True, False)
+    assert (everywhere.completed.pixels, everywhere.measured.pixels) == (2000, 1000)
+    assert (on_parts.completed.pixels, on_parts.measured.pixels) == (200, 100)
+    for errors in (on_parts.completed, on_parts.measured, everywhere.completed, everywhere.measured):
+        assert errors.median_m == pytest.approx(2e-3)
+        assert errors.beyond == pytest.approx(0.1)
+        assert errors.normalised_std is None
+
+
+def test_rows_without_completed_pixels_have_no_say_in_the_errors() -> None:
+    _, everywhere = summarise_depth([with_errors(NBV, 1, 1000, 1e-3), with_errors(NBV, 1, 0, None)])
+    assert (everywhere.completed.pixels, everywhere.completed.median_m) == (500, pytest.approx(1e-3))
+
+
+def test_errors_at_the_reference_view_alone_are_listed_once_and_rows_not_judged_never() -> None:
+    rows = [with_errors(s, n, 1000, 1e-3) for s in (NBV, FAR) for n in (0, 1)] + [row(RANDOM, "a", 0.5)]
+    assert [(point.label, point.views_added) for point in summarise_depth(rows) if point.on_parts] == [
+        ("single view", 0), ("nbv", 1), ("max_distance", 1)
+    ]  # fmt: skip
+
+
 def test_no_rows_give_no_points() -> None:
     assert summarise([]) == []
+    assert summarise_depth([]) == []
 
 
 def picture(points: list[Point], title: str = "gear") -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from sidelong.geometry.camera_model import PinholeCamera
+from sidelong.geometry.camera_model import LightProjector, PinholeCamera, StereoRig
 from sidelong.geometry.mesh import Part, part_from_arrays
 from sidelong.geometry.raycast import RayScene
 from sidelong.geometry.transforms import invert, look_at, rotation_about, transform, transform_points
@@ -13,6 +13,7 @@ from sidelong.simulation.parts import simulated_part
 from sidelong.types import BoolArray, FloatArray, Frame, Projector, View
 
 CAMERA = PinholeCamera(width=640, height=512, fx=541.5, fy=541.5, cx=318.2, cy=254.7)
+RIG = StereoRig(CAMERA, CAMERA, 0.1, LightProjector(np.eye(4), 0.5, 0.4))
 REFERENCE = look_at((0.0, 0.0, 0.7), (0.0, 0.0, 0.0))
 OTHERS = tuple(
     look_at((0.35 * np.cos(turn), 0.35 * np.sin(turn), 0.6), (0.0, 0.0, 0.0), roll_rad=roll)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sidelong.calibration.depth_noise import noise_blur_px
+from sidelong.calibration.depth_noise.blur import noise_blur_px
 from sidelong.calibration.normals import informative_normals
 from sidelong.simulation.rig import rig_for
 from sidelong.types import FloatArray

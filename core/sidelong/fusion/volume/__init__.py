@@ -1,0 +1,1 @@
+"""Depth maps fused in a grid of voxels, which gives the surface of the whole bin as well."""

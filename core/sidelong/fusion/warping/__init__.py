@@ -1,0 +1,1 @@
+"""Depth maps warped into the reference view, pixel by pixel."""
