@@ -199,14 +199,14 @@ def test_views_from_wrong_poses_are_refused_and_the_scan_goes_on_without_them() 
 
 def test_the_model_completes_what_no_view_measured_where_that_is_asked_for(sharp_world: World) -> None:
     """Detected poses, a little off, are refined by depth; then the CAD model fills in, marked, and is not counted."""
-    recipe = Recipe(fusion=FusionSettings(model=ModelSettings()), planning=PlanningSettings(max_views=0))
+    recipe = Recipe(fusion=FusionSettings(model=ModelSettings()), planning=PlanningSettings(max_views=1))
     part, rig = sharp_world.camera.part, sharp_world.camera.rig
     with build_stages(recipe, part, rig, Path(), objects=disturbed(sharp_world)) as stages:
         refined = replace(stages, new_refiner=partial(Refiner, part, rig.left, RefinementSettings()))
         taken = list(scan(sharp_world.cell, refined, recipe, Stopwatch()))
     last = taken[-1]
     modelled = last.depth.state == PixelState.MODELLED
-    assert modelled.sum() > 100
+    assert modelled.sum() > 50
     truth_m = sharp_world.camera.true_depth_m(taken[0].view.base_T_camera)
     assert np.median(np.abs(last.depth.depth_m - truth_m)[modelled]) < 1e-3
     assert not last.depth.trusted[modelled].any()

@@ -19,7 +19,7 @@ def modelled_depth(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the depth that the CAD model gives where its pose is certain, and its standard deviation.
 
-    A pose is certain with at least ``least_probability``, a covariance, and depth of some view that supports it; a
+    A pose is certain with at least ``least_probability``, a covariance, and depth of ``least_views`` that support it; a
     depth, if the covariance of its pose moves it by at most ``largest_sigma_m``. Poses that are less certain hide what
     lies behind.
 
@@ -33,7 +33,8 @@ def modelled_depth(
     sigma_m = np.full(seen.depth_m.shape, np.nan)
     for index, item in enumerate(objects):
         best = item.hypotheses[0]
-        if best.probability < settings.least_probability or best.covariance is None or not item.supporting_views:
+        told = len(item.supporting_views) >= settings.least_views
+        if best.probability < settings.least_probability or best.covariance is None or not told:
             continue
         rows, columns = np.nonzero(seen.instance == index)
         rays = camera.rays(columns.astype(np.float64), rows.astype(np.float64))

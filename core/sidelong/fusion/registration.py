@@ -23,7 +23,7 @@ from sidelong.types import Float32Array, FloatArray
 KERNELS_M = (4e-3, 4e-3, 2e-3, 1e-3, 1e-3)
 """One step each: the first find what is shared, the last no longer look at what is not."""
 
-ALIKE = 0.2
+ALIKE = 0.15
 """Of a camera's noise, what all depths of a map have in common: a matcher's disparity is off by what is left of a
 pixel, and on the ground of a bin that is much the same everywhere. Taken for nothing, it tilts views, and what is
 tilted about a camera 0.7 m away slides."""

@@ -44,6 +44,7 @@ class ModelSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     least_probability: Annotated[FiniteFloat, Field(gt=0, le=1, description="of the pose")] = 0.9
+    least_views: Annotated[int, Field(ge=1, le=100, description="whose depth agrees with the pose")] = 2
     largest_sigma_m: Annotated[
         FiniteFloat, Field(gt=0, le=0.01, description="standard deviation of the depth that the pose gives")
     ] = 0.5e-3

@@ -20,7 +20,7 @@ SETTINGS = ModelSettings()
 
 
 def found(
-    pose: FloatArray = POSE, probability: float = 1.0, sigma: float = 1e-4, views: tuple[str, ...] = ("top",)
+    pose: FloatArray = POSE, probability: float = 1.0, sigma: float = 1e-4, views: tuple[str, ...] = ("top", "side")
 ) -> DetectedObject:
     return DetectedObject((Hypothesis(pose, 90.0, probability, sigma**2 * np.eye(6)),), supporting_views=views)
 
@@ -41,7 +41,7 @@ def test_sigma_is_how_far_an_error_of_the_pose_moves_the_depth(direction: int) -
     size = 1e-4
     covariance = np.zeros((6, 6))
     covariance[direction, direction] = size**2
-    item = DetectedObject((Hypothesis(POSE, 90.0, 1.0, covariance),), supporting_views=("top",))
+    item = DetectedObject((Hypothesis(POSE, 90.0, 1.0, covariance),), supporting_views=("top", "side"))
     depth_m, sigma_m = modelled_depth(PART, CAMERA, ModelSettings(largest_sigma_m=0.01), (item,))
     moved = POSE.copy()
     if direction < 3:
@@ -57,7 +57,8 @@ def test_sigma_is_how_far_an_error_of_the_pose_moves_the_depth(direction: int) -
 
 
 @pytest.mark.parametrize(
-    "item", [found(probability=0.5), found(sigma=5e-3), found(views=()), DetectedObject((Hypothesis(POSE, 90.0, 1.0),))]
+    "item",
+    [found(probability=0.5), found(sigma=5e-3), found(views=("top",)), DetectedObject((Hypothesis(POSE, 90.0, 1.0),))],
 )
 def test_a_pose_that_is_not_certain_gives_nothing(item: DetectedObject) -> None:
     depth_m, sigma_m = modelled_depth(PART, CAMERA, SETTINGS, (item,))

@@ -70,8 +70,8 @@ def warp(view: PosedDepth, camera: PinholeCamera, holes: Holes, settings: Fusion
     overlap on smooth surfaces, never bridge a depth edge, and a lone pixel counts as well (facing its own camera).
 
     A hole takes the mean of the depths within ``front_band_m`` of the nearest one. Tiles whose back the reference
-    camera sees are dropped. The variance is that of one depth, for the errors of neighbours are much alike: noise and
-    the error of the pose move the tile, and the line of sight of the hole meets it elsewhere.
+    camera sees are dropped. The variance is little less than that of one depth, for the errors of neighbours are much
+    alike: noise and the error of the pose move the tile, and the line of sight of the hole meets it elsewhere.
     """
     inverse = np.float32(1) / view.depth_m
     motion = motion_of(camera, view.reference_T_view)
