@@ -15,7 +15,18 @@ from sidelong_service.app import create_app
 from sidelong_service.problems import MEDIA_TYPE, Problem
 from sidelong_service.settings import ServiceSettings
 
-HEAVY = ["open3d", "trimesh", "cv2", "scipy", "matplotlib", "rtde_control", "rtde_receive", "nxlib", "sidelong_drivers"]
+HEAVY = [
+    "open3d",
+    "trimesh",
+    "cv2",
+    "scipy",
+    "matplotlib",
+    "numba",
+    "rtde_control",
+    "rtde_receive",
+    "nxlib",
+    "sidelong_drivers",
+]
 APP = create_app(ServiceSettings())
 
 

@@ -58,6 +58,10 @@ class FusionSettings(BaseModel):
     mean of all choices, and rms of those: 1.0 px 37.9 %, 0.72 mm; 1.5 px 42.3 %, 0.73 mm; 2.0 px 44.5 %, 0.75 mm. The
     default carries a depth a quarter of a pixel beyond its own, far less than the window a stereo matcher compares; at
     1.0 px noise opens gaps between neighbours (2 % of the pixels at 0.1 mm).
+
+    ``behind_m``: of completed pixels on parts, with poses refined by depth, 8 mm marks 0.0 % of the right ones and 70 %
+    of the wrong, 4 mm 0.2 and 74 %, 3 mm 0.3 and 75 % (recorded scene, five references); simulated heaps of four parts
+    say the same. Where poses are left as detected they are off by more: give it 8 mm there.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -87,7 +91,7 @@ class FusionSettings(BaseModel):
     behind_m: Annotated[
         FiniteFloat,
         Field(ge=0, le=10, description="depths further behind the believed surface of a part are doubtful"),
-    ] = 8e-3
+    ] = 4e-3
     max_incidence_rad: Annotated[
         FiniteFloat, Field(gt=0, lt=1.57, description="neighbours that rise more steeply are taken for a depth edge")
     ] = 1.3

@@ -457,7 +457,7 @@ def test_ground_seen_past_an_unmeasured_part_is_doubtful_until_the_part_is_seen(
     depth = completion.depth
     filled = part & np.isfinite(depth.depth_m)
     assert filled.sum() > 100
-    wrong = filled & (depth.depth_m - truth > 0.008)
+    wrong = filled & (depth.depth_m - truth > 0.004)
     assert np.array_equal(depth.state == PixelState.DOUBTFUL, wrong)
     assert completion.missing[wrong].all()
     assert wrong.sum() > 0.5 * filled.sum()
