@@ -6,13 +6,17 @@ one it falls back on aborts the process when two threads enter it, and the other
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -27,10 +31,36 @@ def compiled(function: Function) -> Function:
     """
     # products may be fused with sums and quotients turned into products; NaN keeps its meaning: it is missing depth
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp"}}
-    try:
-        return cast(Function, numba.njit(cache=True, **options)(function))
-    except RuntimeError:  # "no locator available": no folder to keep it in
-        return cast(Function, numba.njit(**options)(function))
+    dispatcher: Any = numba.njit(**options)(function)
+    with suppress(RuntimeError):  # "no locator available": there is no folder to keep it in
+        dispatcher._cache = _PackageCache(function)  # what cache=True does, with another cache
+    return cast(Function, dispatcher)
+
+
+class _PackageCache(FunctionCache):
+    """Forgets what it keeps when any file of loops in this package changes.
+
+    Numba's own looks at the file of the function alone: one that calls a changed function of another file would go on
+    with what that was.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        own: Any = self
+        self._cache_file = IndexDataCacheFile(
+            cache_path=own._cache_path, filename_base=own._impl.filename_base, source_stamp=_stamp()
+        )
+
+
+@cache
+def _stamp() -> str:
+    """Return a digest of all files of this package that hold compiled functions."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        content = path.read_bytes()
+        if b"@compiled" in content or b"@inlined" in content:
+            digest.update(content)
+    return digest.hexdigest()
 
 
 def inlined(function: Function) -> Function:

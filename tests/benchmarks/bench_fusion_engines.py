@@ -346,7 +346,8 @@ def row(name: str, done: Run, case: Case, asked: BoolArray) -> str:
     median, p95 = np.percentile(errors_mm, (50, 95)) if errors_mm.size else (np.nan, np.nan)
     honest = f"{z.std():5.2f} {(np.abs(z) < 1.96).mean():6.1%}" if np.isfinite(z).any() else f"{'':5} {'':6}"
     return (
-        f"{name:30} {np.median(done.add_s[1:]) * 1e3:7.0f} {np.median(done.cpu_s[1:]) * 1e3:7.0f} {done.render_s * 1e3:7.0f} "
+        f"{name:30} {np.median(done.add_s[1:]) * 1e3:7.0f} {np.median(done.cpu_s[1:]) * 1e3:7.0f} "
+        f"{done.render_s * 1e3:7.0f} "
         f"{done.megabytes:5.0f} {asked.sum():7d} {back.mean():6.1%} {np.sqrt(np.mean(errors_mm**2)):7.3f} "
         f"{median:7.3f} {p95:7.3f} {beyond[completed].mean():7.2%} {beyond[open_].mean():7.2%} "
         f"{(back & open_[asked]).mean():6.1%} {honest}\n"

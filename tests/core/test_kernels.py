@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sidelong
 from sidelong.kernels import compiled, strips, threads
 
 
@@ -79,3 +81,27 @@ def test_where_nothing_can_be_kept_it_is_compiled_anew(tmp_path: Path) -> None:
     finally:
         tmp_path.chmod(0o755)
     assert ran.stdout.strip() == "42", ran.stderr
+
+
+def test_what_is_kept_is_forgotten_when_another_file_of_loops_changes(tmp_path: Path) -> None:
+    """A loop calls a loop of another file, which then changes: numba alone would go on with the old one."""
+    package = tmp_path / "sidelong"
+    shutil.copytree(Path(sidelong.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    (package / "callee.py").write_text(
+        "from sidelong.kernels import compiled\n\n@compiled\ndef answer():\n    return 1\n"
+    )
+    (package / "caller.py").write_text(
+        "from sidelong.kernels import compiled\nfrom sidelong.callee import answer\n\n"
+        "@compiled\ndef asked():\n    return answer() + 40\n\nprint(asked(), len(asked.stats.cache_hits))\n"
+    )
+    command = [sys.executable, "-c", "import sidelong.caller"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+
+    def asked() -> str:
+        ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=True)
+        return ran.stdout.strip()
+
+    assert [asked(), asked()] == ["41 0", "41 1"]
+    changed = (package / "callee.py").read_text().replace("return 1", "return 2")
+    (package / "callee.py").write_text(changed)
+    assert asked() == "42 0"
