@@ -31,6 +31,7 @@ from sidelong_service.command import (
     recipe_of,
 )
 from sidelong_service.console import (
+    DEPTH_TABLE_WIDTH,
     CountedProgress,
     ScanProgress,
     comparison_table,
@@ -217,7 +218,8 @@ def _show_comparison(rows: list[Row], plot: Path) -> None:
         out.print(pose_table(judged))
     errors = summarise_depth(rows)
     for on_parts in (True, False) if errors else ():
-        out.print(depth_table(errors, on_parts=on_parts))
+        # wider than what is not a terminal is taken to be
+        out.print(depth_table(errors, on_parts=on_parts), width=max(out.width, DEPTH_TABLE_WIDTH), crop=False)
     write_whole(plot, draw(points, f"{', '.join(dict.fromkeys(row.object for row in rows))}: {len(rows)} rows"))
     out.print(f"  {plot}", highlight=False, markup=False, soft_wrap=True)
 

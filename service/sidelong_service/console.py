@@ -170,9 +170,15 @@ def pose_table(points: Sequence[PosePoint]) -> Table:
     return table
 
 
+DEPTH_TABLE_WIDTH = 110
+
+
 def depth_table(points: Sequence[DepthPoint], *, on_parts: bool) -> Table:
-    """Return the table of the depth, on the parts or everywhere: errors of filled pixels, the 95th percentile of the
-    rest that is within 2 mm, whether sigma is honest, and the sensor's own where the reference view measured."""
+    """Return the table of the depth, on the parts or everywhere.
+
+    Errors of filled pixels, the 95th percentile of the rest that is within 2 mm, whether sigma is honest, and the
+    sensor's own where the reference view measured.
+    """
     title = "errors of the depth on the parts" if on_parts else "errors of the depth wherever the truth is known"
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, title=title, title_justify="left")
     table.add_column("\nstrategy", no_wrap=True)
