@@ -148,7 +148,6 @@ class Completion:
             return _fused(
                 as_the_arm_says(pose, None), float("nan"), f"the same capture as view {self._captures[digest]}"
             )
-        self._captures[digest] = frame.view.name
         sigma_m = self._settings.noise.sigma_m(depth_m, self._rig)
         found = self._registered(depth_m, sigma_m, pose)
         view = PosedDepth(self._step, depth_m, sigma_m, found.reference_T_view, found.covariance)
@@ -162,6 +161,7 @@ class Completion:
         except DepthError as error:  # no room for it
             return _fused(found, agreed, str(error))
         self._contradictions.add(view)
+        self._captures[digest] = frame.view.name
         self._depth = None
         return _fused(
             found, agreed, None, int((self._told & ~told).sum()),

@@ -28,6 +28,11 @@ ALIKE = 0.15
 pixel, and on the ground of a bin that is much the same everywhere. Taken for nothing, it tilts views, and what is
 tilted about a camera 0.7 m away slides."""
 
+LEAST_INFORMATION = 0.1
+"""On a direction, in units of what the prior holds: less is scaled as if it were that."""
+ROUNDING = 1e-6
+"""Of information that is a million times the prior's, in units of the least; where nothing is told, it is the noise."""
+
 LEAST_POINTS = 100
 """Fewer shared points tell nothing of a pose."""
 
@@ -84,10 +89,10 @@ def register(
     settings
         What the arm may err.
     """
-    prior = _arm_covariance(reference_T_view, settings)
+    root: FloatArray = np.linalg.cholesky(_arm_covariance(reference_T_view, settings)).astype(np.float64)
     alike = ALIKE * common_noise(*view), ALIKE * common_noise(*reference)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    pose, correction, covariance, count = reference_T_view, np.zeros(6), prior, 0
+    pose, correction, covariance, count = reference_T_view, np.zeros(6), root @ root.T, 0
     for step, kernel_m in enumerate(KERNELS_M):
         # at first it is the pose that makes residuals large, in the end what is not as the noise says
         as_seen = step >= len(KERNELS_M) - 2
@@ -97,16 +102,31 @@ def register(
         hessian, gradient, scatter, modes = (_summed([part[k] for part in parts]) for k in range(4))
         if count < LEAST_POINTS:
             return as_the_arm_says(reference_T_view, settings)
-        told = prior @ hessian
-        # of all that is linear in the gradient, this comes nearest: what it tells, H c, stands in noise of covariance S
-        gain = np.linalg.solve(hessian @ told + scatter + modes @ modes.T, told.T).T
-        correction: FloatArray = gain @ (hessian @ correction - gradient)
-        covariance: FloatArray = prior - gain @ told.T
+        correction, covariance = _estimate(hessian, scatter + modes @ modes.T, hessian @ correction - gradient, root)
         pose = _moved(reference_T_view, correction)
-    return Registered(
-        pose, (covariance + covariance.T) / 2, float(np.linalg.norm(correction[3:])),
-        float(np.linalg.norm(correction[:3])), int(count),
-    )  # fmt: skip
+    shift_m, turn_rad = float(np.linalg.norm(correction[3:])), float(np.linalg.norm(correction[:3]))
+    return Registered(pose, covariance, shift_m, turn_rad, count)
+
+
+def _estimate(
+    hessian: FloatArray, noise: FloatArray, told: FloatArray, root: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the correction c (6,) and its covariance (6, 6) from ``told = hessian c`` and noise of that covariance.
+
+    Of all that is linear in what is told, the estimate comes nearest to a correction drawn from the prior ``root
+    root^T``. It is made along the principal axes of the information in units of the prior, each scaled by itself: on a
+    plane three of them hold a million times the information of the other three, which may be exactly none.
+    """
+    rows, values, columns = np.linalg.svd(root.T @ hessian @ root)
+    scale = 1.0 / np.maximum(values, LEAST_INFORMATION)
+    share = values * scale
+    heard = (root @ rows) * scale
+    inverse = np.linalg.inv(np.diag(share**2 + ROUNDING) + heard.T @ noise @ heard)
+    base = root @ columns.T
+    correction: FloatArray = base @ (share[:, None] * inverse) @ (heard.T @ told)
+    left = (1 + ROUNDING) * np.eye(6) - share[:, None] * inverse * share
+    covariance: FloatArray = base @ left @ base.T
+    return correction, (covariance + covariance.T) / 2
 
 
 def _summed(arrays: list[FloatArray]) -> FloatArray:

@@ -16,6 +16,8 @@ INDEPENDENT_PX = 6
 """Every so many-th row and column takes part: within its window the errors of a stereo matcher are much alike."""
 FLAT_M, FLAT_SIGMAS = 1e-3, 2.0
 """How far the middle of three depths may be off the mean of the outer two, twice; and as much for noise."""
+LEAST_VARIANCE_M2 = 1e-14
+"""A tenth of a micrometre: depth without noise is no reason to divide by zero."""
 FLATTENED = 0.3
 """Of such a bend, what the mean over the window takes off."""
 LEAST_AGREEMENT = 0.8
@@ -36,9 +38,9 @@ def accumulate(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, int]:
     """Return normal equations of point-to-plane registration, and how many points take part.
 
-    The noise of normals, squared, would look like information: a plane whose normals waver seems to hold against
-    sliding. So the matrix is summed from products of the reference's normal and the view's, whose errors are
-    independent (instrumental variables).
+    Residuals are distances from planes of the reference. The noise of their normals, squared, would look like
+    information: a plane whose normals waver seems to hold against sliding. So residuals are projected on the normals of
+    the view, whose errors are independent of them (instrumental variables), and the matrix is not symmetric.
 
     Parameters
     ----------
@@ -103,7 +105,9 @@ def accumulate(
             own_facing = (n_x * arm[0] + n_y * arm[1] + n_z * arm[2]) / z
             its_facing = 1.0 / (surface_m[v, u] * length)
             own, its = sigma_m[row, column] * own_facing, surface_sigma_m[v, u] * its_facing
-            variance = own * own + its * its + (FLATTENED * bend_m) ** 2 + (FLATTENED * own_bend_m) ** 2
+            variance = (
+                LEAST_VARIANCE_M2 + own * own + its * its + (FLATTENED * bend_m) ** 2 + (FLATTENED * own_bend_m) ** 2
+            )
             reach = max(kernel_m, 4.0 * math.sqrt(variance))
             share = residual * residual / (reach * reach)
             if share >= 1.0:
@@ -116,11 +120,11 @@ def accumulate(
             _fill_modes(off_m, 0, own_off, 2.0 * column / width - 1.0, 2.0 * row / height - 1.0)
             _fill_modes(off_m, 3, its_off, 2.0 * u / width - 1.0, 2.0 * v / height - 1.0)
             for i in range(6):
-                gradient[i] += weight * residual * jacobian[i]
+                gradient[i] += weight * residual * instrument[i]
                 for j in range(6):
-                    scatter[i, j] += spread * jacobian[i] * jacobian[j]
-                    modes[i, j] += weight * jacobian[i] * off_m[j]
-                    hessian[i, j] += 0.5 * weight * (jacobian[i] * instrument[j] + instrument[i] * jacobian[j])
+                    scatter[i, j] += spread * instrument[i] * instrument[j]
+                    modes[i, j] += weight * instrument[i] * off_m[j]
+                    hessian[i, j] += weight * instrument[i] * jacobian[j]
             count += 1
     return hessian, gradient, scatter, modes, count
 

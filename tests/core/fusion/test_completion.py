@@ -290,6 +290,10 @@ def test_the_same_capture_twice_says_no_more(truth: FloatArray, holes: BoolArray
     assert again.refused == "the same capture as view side"
     np.testing.assert_array_equal(completion.depth.sigma_m, once.sigma_m)
     assert completion.add(frame_of(punched(truth, holes), REFERENCE)).refused == "the same capture as view v"
+    # one that was refused for its pose was not fused: with the right pose it is
+    wrong = transform(np.eye(3), (0.05, 0.0, 0.0)) @ OTHERS[1]
+    assert completion.add(frame_of(others[1], wrong)).refused is not None
+    assert completion.add(frame_of(others[1], OTHERS[1])).refused is None
 
 
 def test_views_from_one_place_count_as_one(truth: FloatArray, holes: BoolArray) -> None:

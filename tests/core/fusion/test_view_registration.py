@@ -97,6 +97,31 @@ def test_a_plane_tells_height_and_tilt_and_nothing_of_what_slides() -> None:
     assert point_sigma_m[1] < 0.05 * _sigma_at_scene_m(arm.covariance, true, normal)
 
 
+@pytest.mark.parametrize("quantum_m", [1e-12, 3.125e-5, 1e-4])
+@pytest.mark.parametrize("sigma_m", [0.0, 5e-5])
+def test_planes_without_noise_or_in_steps_are_no_singular_case(quantum_m: float, sigma_m: float) -> None:
+    """What is told is told exactly, or to a fraction of a step; what is not, not at all: three directions have no noise
+    and no information."""
+    true = invert(REFERENCE) @ OTHERS[0]
+    sigma = np.full(SHAPE, sigma_m, dtype=np.float32)
+    depths = (np.round(plane_m(pose) / quantum_m) * quantum_m for pose in (OTHERS[0], REFERENCE))
+    view, reference = ((smoothed(depth_m.astype(np.float32)), sigma) for depth_m in depths)
+    arm = off_by(true, np.zeros(3), np.array([0.4e-3, 0.3e-3, 0.2e-3]))
+    found = register(view, reference, arm, CAMERA, SETTINGS)
+    x, y, z = error_at_scene_m(found.reference_T_view, true)
+    assert abs(z) < max(0.05 * quantum_m, 3e-6)
+    assert (x, y) == pytest.approx((0.4e-3, 0.3e-3), abs=0.03e-3)
+    assert np.linalg.eigvalsh(found.covariance).min() > 0
+
+
+def test_a_faced_plane_seen_from_beside_itself_is_left_where_it_is() -> None:
+    beside = off_by(np.eye(4), np.zeros(3), np.array([0.05, 0.0, 0.0]))
+    flat = smoothed(np.full(SHAPE, 0.5, dtype=np.float32)), np.full(SHAPE, NOISE_M, dtype=np.float32)
+    found = register(flat, flat, beside, CAMERA, SETTINGS)
+    np.testing.assert_allclose(found.reference_T_view, beside, atol=1e-9)
+    assert np.isfinite(found.covariance).all()
+
+
 def _sigma_at_scene_m(covariance: FloatArray, reference_T_view: FloatArray, direction: FloatArray) -> float:
     arm = np.array([0.0, 0.0, 0.7]) - reference_T_view[:3, 3]
     moved = np.concatenate([np.cross(arm, direction), direction])
