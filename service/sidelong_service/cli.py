@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import ValidationError
+from rich.console import Console
 
 from sidelong.commissioning.documents import Document
 from sidelong.errors import SidelongError
@@ -218,8 +219,9 @@ def _show_comparison(rows: list[Row], plot: Path) -> None:
         out.print(pose_table(judged))
     errors = summarise_depth(rows)
     for on_parts in (True, False) if errors else ():
-        # wider than what is not a terminal is taken to be
-        out.print(depth_table(errors, on_parts=on_parts), width=max(out.width, DEPTH_TABLE_WIDTH), crop=False)
+        # a file or a pipe is taken to be 80 wide, which cuts this table
+        wide = out if out.is_terminal else Console(width=DEPTH_TABLE_WIDTH)
+        wide.print(depth_table(errors, on_parts=on_parts))
     write_whole(plot, draw(points, f"{', '.join(dict.fromkeys(row.object for row in rows))}: {len(rows)} rows"))
     out.print(f"  {plot}", highlight=False, markup=False, soft_wrap=True)
 
