@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from sidelong.commissioning.documents import NoiseDocument
 from sidelong.commissioning.figures import png
 from sidelong.commissioning.made import Captures, Made, Progress, parameter
 from sidelong.commissioning.tasks import NoiseTask
-from sidelong.errors import DatasetError
 from sidelong.types import FloatArray
 
 FOLDERS = {"plate": "Plane", "repeats": "Repeats"}
@@ -35,7 +33,7 @@ def make_noise(task: NoiseTask, captures: Captures, progress: Progress) -> Made:
     CalibrationError
         They cannot carry the noise.
     """
-    files = _files(captures, FOLDERS[task.method])
+    files = captures.recorded.depth_files(FOLDERS[task.method])
     depth_maps_m: dict[str, FloatArray] = {}
     for file in files:
         progress("depth maps", len(depth_maps_m), len(files) + 1)
@@ -57,19 +55,6 @@ def make_noise(task: NoiseTask, captures: Captures, progress: Progress) -> Made:
     picture = draw_noise(fit)
     progress("depth maps", len(files) + 1, len(files) + 1)
     return Made(document, picture, _summary(fit))
-
-
-def _files(captures: Captures, kind: str) -> tuple[Path, ...]:
-    root = captures.dataset.root
-    owners = [root / captures.object, root] if captures.object is not None else [root]
-    folders = [owner / "Calibration" / kind for owner in owners]
-    found = next((folder for folder in folders if folder.is_dir()), None)
-    if found is None:
-        raise DatasetError(f"{' and '.join(map(str, folders))}: no such folder of captures")
-    files = tuple(sorted(found.glob("DEPTH_*.png"), key=lambda file: (len(file.name), file.name)))
-    if not files:
-        raise DatasetError(f"{found}: has no DEPTH_<i>.png")
-    return files
 
 
 def _summary(fit: NoiseFit) -> str:

@@ -69,7 +69,7 @@ class Contradictions:
         hidden = np.zeros(self._odds.shape, dtype=np.bool_)
         strips(
             lambda first, last: vote_on_measured(
-                own.depth_m, self._sigma_m, view.depth_m[None], back, 0, limits, self._odds, first, last
+                own.depth_m, self._sigma_m, view.depth_m[None], back, limits, self._odds, first, last
             ),
             len(self._odds),
             each=4,

@@ -59,9 +59,8 @@ class FusionSettings(BaseModel):
     default carries a depth a quarter of a pixel beyond its own, far less than the window a stereo matcher compares; at
     1.0 px noise opens gaps between neighbours (2 % of the pixels at 0.1 mm).
 
-    ``behind_m``: of completed pixels on parts, with poses refined by depth, 8 mm marks 0.0 % of the right ones and 70 %
-    of the wrong, 4 mm 0.2 and 74 %, 3 mm 0.3 and 75 % (recorded scene, five references); simulated heaps of four parts
-    say the same. Where poses are left as detected they are off by more: give it 8 mm there.
+    ``behind_m`` suits poses refined by depth: it takes hardly a right depth with it. Poses left as detected are off by
+    more: give it 8 mm there.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)

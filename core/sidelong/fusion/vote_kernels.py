@@ -77,13 +77,12 @@ def vote_on_measured(
     sigma_m: Float32Array,
     views: Float32Array,
     motions: Float32Array,
-    number: int,
     limits: Float32Array,
     odds: Float32Array,
     first: int,
     last: int,
 ) -> None:
-    """Add the vote of view ``number`` on rows ``first`` to ``last`` of a depth map to ``odds`` (H, W).
+    """Add the vote of view 0 on rows ``first`` to ``last`` of a depth map to ``odds`` (H, W).
 
     ``limits``: tolerance in standard deviations and in metres at least, weight of a vote.
     """
@@ -93,7 +92,7 @@ def vote_on_measured(
             z = depth_m[row, column]
             if z > 0:
                 tolerance = max(least_m, spread * BOTH * sigma_m[row, column])
-                odds[row, column] += weight * verdict(views, motions, number, column, row, z, tolerance)
+                odds[row, column] += weight * verdict(views, motions, 0, column, row, z, tolerance)
 
 
 @compiled

@@ -263,6 +263,20 @@ class CalibrationCaptures:
             files=(board_file, poses_file, *files),
         )
 
+    def depth_files(self, kind: str) -> tuple[Path, ...]:
+        """Return ``DEPTH_<i>.png`` of a kind of captures, by their numbers.
+
+        Raises
+        ------
+        DatasetError
+            There is no folder of this kind, or no such file in it.
+        """
+        folder = self._folder(kind)
+        files = tuple(sorted(folder.glob("DEPTH_*.png"), key=lambda file: (len(file.name), file.name)))
+        if not files:
+            raise DatasetError(f"{folder}: has no DEPTH_<i>.png")
+        return files
+
     def _folder(self, kind: str) -> Path:
         owners = [self.dataset.root / self.object] if self.object is not None else []
         folders = [owner / "Calibration" / kind for owner in (*owners, self.dataset.root)]

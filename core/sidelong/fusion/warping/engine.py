@@ -50,7 +50,8 @@ class WarpEngine:
         )  # fmt: skip
         self._maps = np.empty((settings.max_views, *wanted.shape), dtype=np.float32)
         self._motions = np.empty((settings.max_views, 4, 3), dtype=np.float32)
-        self._views: list[PosedDepth] = []
+        self._poses: list[FloatArray] = []
+        self._steps: list[int] = []
         self._settled: IntArray | None = None
         """(N,) sources of layer 0 where it stands for views that are forgotten."""
         self._estimate: Estimate | None = None
@@ -61,13 +62,14 @@ class WarpEngine:
 
     def add(self, view: PosedDepth) -> None:
         """Take in the depth map of one more view."""
-        if len(self._views) == self._settings.max_views:
+        if len(self._steps) == self._settings.max_views:
             self._forget_views()
-        warp(view, self._camera, self._holes, self._settings, self._layer(self._first + len(self._views)))
-        camera_T_reference = invert(view.reference_T_view)
-        self._maps[len(self._views)] = view.depth_m
-        self._motions[len(self._views)] = motion_of(self._camera, camera_T_reference)[:4]
-        self._views.append(view)
+        number = len(self._steps)
+        warp(view, self._camera, self._holes, self._settings, self._layer(self._first + number))
+        self._maps[number] = view.depth_m
+        self._motions[number] = motion_of(self._camera, invert(view.reference_T_view))[:4]
+        self._poses.append(view.reference_T_view)
+        self._steps.append(view.step)
         self._estimate = None
 
     @property
@@ -84,7 +86,8 @@ class WarpEngine:
         self._settled = settled.source
         depth_m, variance_m2, trust = self._layer(0)
         depth_m[:], variance_m2[:], trust[:] = settled.depth_m, settled.sigma_m**2, odds
-        self._views.clear()
+        self._poses.clear()
+        self._steps.clear()
 
     def estimate(self) -> Estimate:
         """Return the depth of the holes as all views show it."""
@@ -94,11 +97,11 @@ class WarpEngine:
 
     def _settle(self) -> tuple[Estimate, Float32Array]:
         """Return the estimate, and the log-odds (N,) of its depths."""
-        s, count = self._settings, self._first + len(self._views)
+        s, count = self._settings, self._first + len(self._steps)
         depth_m, variance_m2, odds = (np.empty(self._holes.count, dtype=np.float32) for _ in range(3))
         layer = np.empty(self._holes.count, dtype=np.int32)
         alike = np.ones(count, dtype=np.float32)
-        alike[self._first :] = _alike([view.reference_T_view for view in self._views])
+        alike[self._first :] = _alike(self._poses)
         limits = np.array([s.agreement_sigmas, s.front_band_m, s.through_m, s.noise.trust], dtype=np.float32)
         view_of = np.arange(count, dtype=np.int32) - self._first
         views = self._maps, self._motions, view_of
@@ -108,7 +111,7 @@ class WarpEngine:
             self._holes.count,
             each=8,
         )
-        steps = np.array([view.step for view in self._views], dtype=np.intp)
+        steps = np.array(self._steps, dtype=np.intp)
         source = np.full(len(layer), MISSING, dtype=np.intp)
         newer = layer >= self._first
         source[newer] = steps[layer[newer] - self._first]
